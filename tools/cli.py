@@ -1,0 +1,5 @@
+"""The command line: `podwatch COMMAND`."""
+
+
+def main() -> None:
+    raise SystemExit(0)
