@@ -1,0 +1,230 @@
+"""What a mission file may say, and what one drone's processes are told. Validated by pydantic; an unknown key is refused."""
+
+from __future__ import annotations
+
+import difflib
+import json
+import tomllib
+from pathlib import Path
+from typing import Any, ClassVar, Self, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+__all__ = [
+    "CameraSettings",
+    "DriverSpec",
+    "DroneSettings",
+    "LimitSettings",
+    "Mission",
+    "MissionError",
+    "RadioSettings",
+    "SearchSettings",
+    "WatchSettings",
+    "load_mission",
+]
+
+
+class MissionError(Exception):
+    """A mission, fleet or settings file that cannot be flown; the message names the key, the value and the remedy."""
+
+
+class Section(BaseModel):
+    """A table of the mission file: unknown keys refused, values frozen once read."""
+
+    model_config: ClassVar[ConfigDict] = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class OriginSettings(Section):
+    """The fleet's origin: n = e = 0 of every local frame, d = 0 the surface."""
+
+    latitude_deg: float = Field(15.30, ge=-90, le=90)
+    longitude_deg: float = Field(-61.50, ge=-180, le=180)
+    altitude_m: float = Field(0.0, ge=-500, le=9000)
+
+
+class CameraSettings(Section):
+    """The downward camera, alike on every drone."""
+
+    width_px: int = Field(640, ge=160, le=4096)
+    height_px: int = Field(480, ge=120, le=4096)
+    vfov_deg: float = Field(60.0, gt=10, lt=150)
+    rate_hz: float = Field(20.0, ge=1, le=60)
+    preview_hz: float = Field(2.0, ge=0.2, le=5)
+    detect_hz: float = Field(5.0, ge=0.5, le=30)
+
+
+class SearchSettings(Section):
+    """Where and how the scout looks."""
+
+    north_m: float = Field(100.0, ge=-20000, le=20000)
+    east_m: float = Field(0.0, ge=-20000, le=20000)
+    height_m: float = Field(40.0, ge=5, le=120)
+    speed_m_s: float = Field(6.0, gt=0, le=15)
+    radius_m: float = Field(150.0, ge=5, le=5000)
+    presence_share: float = Field(0.8, gt=0, le=1)  # of a buffer of recent frames (paper, Scouting)
+    presence_frames: int = Field(15, ge=3, le=200)
+
+
+class WatchSettings(Section):
+    """Gathering over the pod and watching one animal each."""
+
+    watch_s: float = Field(60.0, ge=1, le=7200)  # time in MONITOR before the fleet returns
+    height_m: float = Field(30.0, ge=5, le=120)  # height over the own animal
+    max_height_m: float = Field(60.0, ge=10, le=120)  # ceiling while gathering; partial views above it
+    separation_m: float = Field(8.0, ge=3, le=50)  # between neighbours on the gathering circle
+    animal_length_m: float = Field(10.0, gt=0.5, le=40)
+    speed_m_s: float = Field(8.0, gt=0, le=15)
+    max_animal_speed_m_s: float = Field(4.0, gt=0, le=15)
+    episode_limit_s: float = Field(5.0, ge=2, le=20)
+
+
+class LimitSettings(Section):
+    """What no setpoint may exceed; the bridge clamps to it at the last hop."""
+
+    speed_m_s: float = Field(10.0, gt=0, le=20)
+    climb_m_s: float = Field(3.0, gt=0, le=6)
+    descent_m_s: float = Field(2.0, gt=0, le=4)
+    min_height_m: float = Field(10.0, ge=2, le=100)
+    max_height_m: float = Field(80.0, ge=5, le=120)
+    fence_radius_m: float = Field(600.0, ge=20, le=20000)
+    battery_return: float = Field(0.25, ge=0.05, le=0.9)
+    battery_land: float = Field(0.10, ge=0.02, le=0.5)
+    setpoint_life_s: float = Field(0.5, ge=0.1, le=2.0)
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Self:
+        if self.min_height_m >= self.max_height_m:
+            raise ValueError(f"min_height_m {self.min_height_m} must be below max_height_m {self.max_height_m}")
+        if self.battery_land >= self.battery_return:
+            raise ValueError(f"battery_land {self.battery_land} must be below battery_return {self.battery_return}")
+        return self
+
+
+class RadioSettings(Section):
+    """The ring's links."""
+
+    bytes_per_s: int = Field(6000, ge=500, le=1_000_000)  # cap for each link, headers and seal counted
+    lost_after_s: float = Field(3.0, ge=1, le=30)
+    key_file: str = "fleet.key"
+
+
+class DroneEntry(Section):
+    """One drone of the roster."""
+
+    id: int = Field(ge=1, le=99)
+    home_n_m: float = Field(0.0, ge=-1000, le=1000)
+    home_e_m: float = Field(0.0, ge=-1000, le=1000)
+
+
+class Mission(Section):
+    """A mission file: everything that every drone of a fleet is told."""
+
+    name: str = "mission"
+    origin: OriginSettings = OriginSettings()
+    drones: tuple[DroneEntry, ...] = tuple(DroneEntry(id=i, home_e_m=6.0 * (i - 1)) for i in (1, 2, 3))
+    camera: CameraSettings = CameraSettings()
+    search: SearchSettings = SearchSettings()
+    watch: WatchSettings = WatchSettings()
+    limits: LimitSettings = LimitSettings()
+    radio: RadioSettings = RadioSettings()
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        ids = [drone.id for drone in self.drones]
+        if not ids:
+            raise ValueError("drones: at least one [[drones]] entry is needed")
+        for drone_id in ids:
+            if ids.count(drone_id) > 1:
+                raise ValueError(f"drones: id {drone_id} is given to {ids.count(drone_id)} drones; each needs its own")
+        for name, height_m in (("search.height_m", self.search.height_m), ("watch.height_m", self.watch.height_m)):
+            if not self.limits.min_height_m <= height_m <= self.limits.max_height_m:
+                low, high = self.limits.min_height_m, self.limits.max_height_m
+                raise ValueError(f"{name} = {height_m} lies outside limits.min_height_m to max_height_m, {low} to {high}")
+        return self
+
+    @property
+    def roster(self) -> tuple[int, ...]:
+        """Drone ids in ring order."""
+        return tuple(sorted(drone.id for drone in self.drones))
+
+    def home(self, drone_id: int) -> DroneEntry:
+        """The roster's entry of one drone; KeyError where it has none."""
+        for drone in self.drones:
+            if drone.id == drone_id:
+                return drone
+        raise KeyError(f"drone {drone_id} is not in the roster {self.roster}")
+
+
+class DriverSpec(Section):
+    """A driver by name, `package.module:Class`, and its options: how a process gets its edge without knowing which."""
+
+    driver: str = Field(pattern=r"^[\w.]+:\w+$")
+    options: dict[str, Any] = {}
+
+
+class DroneSettings(Section):
+    """All that one drone's processes are told; `podwatch sim` and `podwatch fly` write it as JSON."""
+
+    drone_id: int = Field(ge=1, le=99)
+    mission: Mission
+    seed: int = 0
+    bus_url: str = ""
+    run_dir: str = "."
+    log_path: str = ""
+    drivers: dict[str, DriverSpec] = {}  # clock, camera, frames, detector, tracker, autopilot, radio
+
+    @classmethod
+    def read(cls, path: Path) -> DroneSettings:
+        """From a JSON file; MissionError says what is wrong with it."""
+        try:
+            return cls.model_validate(json.loads(path.read_text()))
+        except (OSError, ValueError) as error:
+            raise MissionError(f"{path}: {error}") from error
+
+
+S = TypeVar("S", bound=Mission)
+
+
+def load_mission(path: Path, model: type[S]) -> S:
+    """Read and validate a TOML mission file as `model` (Mission or a subclass).
+
+    Raises MissionError: unreadable file, TOML syntax, unknown key (with the nearest valid one), value out of range.
+    """
+    try:
+        data = tomllib.loads(path.read_text())
+    except OSError as error:
+        raise MissionError(f"{path}: cannot be read ({error.strerror}); give the path of a mission file") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise MissionError(f"{path}: not valid TOML: {error}") from error
+    return validate(data, model, str(path))
+
+
+def validate(data: dict[str, Any], model: type[S], source: str) -> S:
+    """`data` as `model`, or MissionError naming each wrong key of `source` with its value and the remedy."""
+    try:
+        return model.model_validate(data)
+    except ValidationError as error:
+        raise MissionError(f"{source}: " + "; ".join(_explain(item, model) for item in error.errors())) from None
+
+
+def _explain(item: Any, model: type[BaseModel]) -> str:
+    where = ".".join(str(part) for part in item["loc"])
+    if item["type"] == "extra_forbidden":
+        valid = _valid_keys(model, item["loc"][:-1])
+        near = difflib.get_close_matches(str(item["loc"][-1]), valid, n=1, cutoff=0.0)
+        return f"unknown key {where!r}" + (f"; did you mean {near[0]!r}?" if near else "") + f" Valid: {', '.join(valid)}"
+    message = item["msg"].removeprefix("Value error, ")
+    value = item.get("input")
+    shown = "" if isinstance(value, dict | BaseModel) else f" (given: {value!r})"
+    return f"{where}: {message}{shown}" if where else f"{message}"
+
+
+def _valid_keys(model: type[BaseModel], path: tuple[Any, ...]) -> list[str]:
+    """Keys that the table at `path` of the model takes."""
+    for part in path:
+        if isinstance(part, int):
+            continue
+        annotation = model.model_fields[part].annotation
+        inner = [a for a in (annotation, *getattr(annotation, "__args__", ())) if isinstance(a, type)]
+        model = next(a for a in inner if issubclass(a, BaseModel))
+    return sorted(model.model_fields)
