@@ -1,0 +1,163 @@
+"""The executor on a real bus: one process, one select loop, one LCM handle.
+
+Traps of lcm 1.5.3 that shape it: a signal during `handle()` raises OSError, so the loop waits in select and handles only what
+is there; the C queue drops the newest message when it is full, so it is made deep and drained at once into the
+runtime's own queues; an LCM made before a fork is broken, so it is made here, after the process has started.
+"""
+
+import importlib
+import os
+import select
+import signal
+from collections.abc import Callable
+from typing import Any
+
+import lcm
+
+from procs.runtime import HEARTBEAT_PERIOD_S, Runtime, RuntimeFailure, Subscription, Transport
+from procs.settings import DriverSpec, DroneSettings
+
+__all__ = ["BusRuntime", "load_driver"]
+
+# Deep enough for the longest handler: messages wait in C for as long as one handler runs.
+C_QUEUE_CAPACITY = 2000
+LONGEST_WAIT_S = 0.5
+# A process that a stop signal finds inside a hung handler is ended by the kernel after this long.
+HARD_STOP_S = 4.0
+DEFAULT_CLOCK = DriverSpec(driver="drivers.clocks.monotonic:MonotonicClock")
+
+
+def load_driver(spec: DriverSpec) -> Any:
+    """The driver that `spec` names, made with its options. Raises RuntimeFailure naming what is wrong."""
+    module, _, name = spec.driver.partition(":")
+    try:
+        factory = getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError) as error:
+        raise RuntimeFailure(f"driver {spec.driver}: cannot be loaded ({error}); check its name in the settings") from error
+    return factory(**spec.options)
+
+
+class BusRuntime(Runtime):
+    """One process on its drone's multicast group."""
+
+    def __init__(self, process: str, settings: DroneSettings) -> None:
+        self._clock = load_driver(settings.drivers.get("clock", DEFAULT_CLOCK))
+        self._now = self._clock.utime()
+        super().__init__(process, settings)
+        try:
+            self._lcm = lcm.LCM(settings.bus_url)
+        except RuntimeError as error:
+            raise RuntimeFailure(
+                f"no bus at {settings.bus_url} ({error}); is there a multicast route? Try: "
+                "ip route add 224.0.0.0/4 dev lo"
+            ) from error
+        self._transports: list[tuple[Transport, Callable[[], None]]] = []
+        self._raw: list[tuple[str, bytes]] = []
+        self._running = True
+        self._cpu_s = 0.0
+        self._cpu_utime = self._now
+        self._wake_read, self._wake_write = os.pipe()
+        os.set_blocking(self._wake_write, False)
+
+    @property
+    def utime(self) -> int:
+        return self._now
+
+    @property
+    def elapsed_us(self) -> int:
+        return int(self._clock.utime()) - self._now
+
+    def open(self, name: str) -> Any:
+        spec = self.settings.drivers.get(name)
+        if spec is None:
+            have = ", ".join(sorted(self.settings.drivers)) or "none"
+            raise RuntimeFailure(f"{self.process}: the settings name no driver for {name!r} (they name: {have})")
+        return load_driver(spec)
+
+    def attach(self, transport: Transport, handler: Callable[[], None]) -> None:
+        self._transports.append((transport, handler))
+
+    def publish_raw(self, channel: str, data: bytes) -> None:
+        self._lcm.publish(channel, data)
+
+    def _listen(self, subscription: Subscription) -> None:
+        handle = self._lcm.subscribe(subscription.channel, lambda _channel, data: self._arrive(subscription, data))
+        handle.set_queue_capacity(C_QUEUE_CAPACITY)
+
+    def _listen_all(self) -> None:
+        handle = self._lcm.subscribe(".*", lambda channel, data: self._raw.append((channel, data)))
+        handle.set_queue_capacity(C_QUEUE_CAPACITY)
+
+    def _vital_signs(self) -> tuple[int, float, float]:
+        times = os.times()
+        cpu_s = times.user + times.system
+        elapsed_s = max(self._now - self._cpu_utime, 1) / 1e6
+        used = (cpu_s - self._cpu_s) / elapsed_s
+        self._cpu_s, self._cpu_utime = cpu_s, self._now
+        with open("/proc/self/statm") as statm:
+            pages = int(statm.read().split()[1])
+        return os.getpid(), used, pages * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+    def stop(self) -> None:
+        """End the loop after the handler that runs."""
+        self._running = False
+
+    def run(self) -> None:
+        """Run until a SIGTERM or SIGINT, then run the stop handlers."""
+        signal.set_wakeup_fd(self._wake_write)
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, self._signalled)
+        self.every(HEARTBEAT_PERIOD_S, self._beat)
+        self._beat()
+        while self._running:
+            self._wait()
+            self._drain()
+            self._read_transports()
+            self._run_due()
+        self._stop()
+
+    def _signalled(self, _number: int, _frame: object) -> None:
+        self._running = False
+        signal.setitimer(signal.ITIMER_REAL, HARD_STOP_S)
+
+    def _wait(self) -> None:
+        """Wait until the bus, a transport, a signal or the next timer has something for us."""
+        self._now = self._clock.utime()
+        due = min(timer.due_utime for timer in self._timers)
+        wait_s = min(max(self._clock.real_seconds((due - self._now) / 1e6), 0.0), LONGEST_WAIT_S)
+        if self._next_waiting() is not None:
+            wait_s = 0.0
+        self._ready, _, _ = select.select([self._lcm, self._wake_read, *(t for t, _ in self._transports)], [], [], wait_s)
+
+    def _drain(self) -> None:
+        """Take everything out of LCM's queue, so that it never fills."""
+        self._now = self._clock.utime()
+        if self._wake_read in self._ready:
+            os.read(self._wake_read, 1024)
+        while self._running and self._lcm.handle_timeout(0) > 0:
+            pass
+        if self._raw and self._raw_handler is not None:
+            raw, self._raw = self._raw, []
+            self._counts["handled"] += len(raw)
+            for channel, data in raw:
+                self._raw_handler(channel, data, self._now)
+
+    def _read_transports(self) -> None:
+        for transport, handler in self._transports:
+            if transport in self._ready:
+                self._now = self._clock.utime()
+                handler()
+
+    def _run_due(self) -> None:
+        """One message, then every due timer: a flood of messages never starves the timers."""
+        subscription = self._next_waiting()
+        if subscription is not None:
+            self._now = self._clock.utime()
+            self._handle_one(subscription)
+        for _ in self._timers:
+            self._now = self._clock.utime()
+            timer = self._due_timer(self._now)
+            if timer is None:
+                return
+            self._clock.late((self._now - timer.due_utime) / 1e6)
+            self._run_timer(timer, self._now)
