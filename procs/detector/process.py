@@ -1,0 +1,70 @@
+"""The detector: finds the animals in the newest frame.
+
+Hears FRAME. Says DETECTIONS at most at camera.detect_hz, with the frame's instant of capture; a frame without animals gives a message without
+boxes. A frame that is gone from the ring is skipped and counted. When FRAME dies it falls silent: presence fades and nobody acts on
+old boxes. A model that is missing or broken ends the process with exit code 3 and the remedy.
+"""
+
+import numpy as np
+
+from lcmtypes import channels, make
+from lcmtypes.podwatch import box_t, detections_t, frame_t
+from procs.detector.yolo import ModelError
+from procs.runtime import Runtime, RuntimeFailure
+
+# A frame this much before its turn still counts, so that 5 Hz of a 20 Hz camera is each fourth frame.
+EARLY_SHARE = 0.25
+
+
+class DetectorShell:
+    """Chooses frames, runs the detector and says what it found."""
+
+    def __init__(self, runtime: Runtime) -> None:
+        self._runtime = runtime
+        self._frames = runtime.open("frames")
+        try:
+            self._detector = runtime.open("detector")
+        except ModelError as error:
+            raise RuntimeFailure(str(error)) from error
+        self._period_us = 1e6 / runtime.settings.mission.camera.detect_hz
+        self._last_utime = 0
+
+    def on_frame(self, frame: frame_t) -> None:
+        """Search one frame, if it is time for one."""
+        since_us = frame.utime - self._last_utime
+        if 0 <= since_us < self._period_us * (1 - EARLY_SHARE):
+            return
+        image = self._frames.read(frame)
+        if image is None:
+            return
+        self._last_utime = frame.utime
+        try:
+            found = self._detector.detect(image)
+        except (ValueError, ModelError) as error:
+            self._runtime.degraded(str(error), cause="detect")
+            return
+        self._runtime.ok("detect")
+        boxes = [
+            make(box_t, left_px=left, top_px=top, right_px=right, bottom_px=bottom, score=score, class_id=kind)
+            for (left, top, right, bottom), score, kind in zip(
+                found.boxes.tolist(), found.scores.tolist(), np.asarray(found.classes).tolist(), strict=True
+            )
+        ]
+        self._runtime.publish(
+            channels.DETECTIONS,
+            make(
+                detections_t,
+                utime=frame.utime,
+                frame_seq=frame.seq,
+                width=frame.width,
+                height=frame.height,
+                compute_us=self._runtime.elapsed_us,
+                n_boxes=len(boxes),
+                boxes=boxes,
+            ),
+        )
+
+
+def setup(runtime: Runtime) -> None:
+    shell = DetectorShell(runtime)
+    runtime.on(channels.FRAME, shell.on_frame, newest=True)
