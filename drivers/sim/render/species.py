@@ -1,0 +1,149 @@
+"""Proportions and colours of the animals, as a small table: all lengths are shares of the body length.
+
+The body runs from the tip of the snout (station 0) to the notch between the flukes (station 1). Widths were set from
+published photogrammetry and field guides; the minke's are the 19 widths that come with the photogrammetry example of
+MorphoMetriX. Training may replace the right whale's by measured outlines (tools/render.py).
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = [
+    "SPECIES",
+    "Species",
+    "body_outline",
+    "fin_outlines",
+    "fluke_outline",
+    "species_named",
+    "with_widths",
+]
+
+Array = NDArray[np.float64]
+
+# Stations along the body at which the widths are given.
+STATIONS = np.array([0.0, 0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.97, 1.0])
+
+
+@dataclass(frozen=True)
+class Species:
+    """Shape and look of one species. Colours are BGR, 0 to 255."""
+
+    name: str
+    widths: tuple[float, ...]  # full width at each station
+    fluke_span: float
+    fluke_chord: float
+    fluke_sweep: float  # how far the tips lie behind the leading edge's root
+    fin_station: float  # where the pectoral fins leave the body
+    fin_length: float
+    fin_chord: float
+    dorsal_station: float  # 0 means no dorsal fin
+    dorsal_height: float
+    back_bgr: tuple[int, int, int]
+    patch_bgr: tuple[int, int, int]  # callosities, scars, mottling
+    head_patches: float  # share of the head covered by light patches
+    mottling: float  # strength of light blotches over the whole body, 0 to 1
+    wrinkles: float  # strength of the lengthwise wrinkles behind the head, 0 to 1
+    length_m: float  # a typical adult
+
+
+SPECIES: dict[str, Species] = {
+    item.name: item
+    for item in (
+        # A square head of a third of the body, a low hump far back, broad triangular flukes.
+        Species(
+            "sperm",
+            (0.075, 0.105, 0.122, 0.132, 0.142, 0.156, 0.172, 0.168, 0.142, 0.104, 0.066, 0.038, 0.034, 0.03),
+            *(0.27, 0.105, 0.085, 0.33, 0.085, 0.05, 0.66, 0.03),
+            *((74, 76, 82), (128, 132, 138), 0.05, 0.25, 1.0, 11.0),
+        ),
+        # Very broad, no dorsal fin, white callosities on the head.
+        Species(
+            "right",
+            (0.03, 0.06, 0.095, 0.145, 0.205, 0.24, 0.245, 0.225, 0.18, 0.125, 0.075, 0.042, 0.035, 0.03),
+            *(0.36, 0.115, 0.1, 0.24, 0.14, 0.085, 0.0, 0.0),
+            *((48, 50, 54), (190, 198, 202), 0.45, 0.1, 0.1, 13.0),
+        ),
+        # Long white-edged pectoral fins.
+        Species(
+            "humpback",
+            (0.03, 0.065, 0.1, 0.14, 0.185, 0.21, 0.215, 0.195, 0.155, 0.108, 0.065, 0.038, 0.034, 0.03),
+            *(0.33, 0.11, 0.1, 0.26, 0.3, 0.07, 0.62, 0.03),
+            *((52, 50, 48), (185, 190, 190), 0.2, 0.1, 0.1, 12.0),
+        ),
+        Species(
+            "minke",
+            (0.012, 0.035, 0.063, 0.091, 0.143, 0.154, 0.166, 0.15, 0.122, 0.086, 0.047, 0.026, 0.022, 0.02),
+            *(0.29, 0.085, 0.08, 0.27, 0.13, 0.04, 0.66, 0.045),
+            *((66, 70, 68), (150, 155, 155), 0.0, 0.1, 0.0, 7.5),
+        ),
+        Species(
+            "fin",
+            (0.01, 0.03, 0.055, 0.078, 0.105, 0.122, 0.126, 0.118, 0.1, 0.074, 0.046, 0.026, 0.022, 0.02),
+            *(0.24, 0.075, 0.07, 0.22, 0.1, 0.035, 0.74, 0.04),
+            *((72, 72, 70), (140, 145, 145), 0.1, 0.05, 0.0, 18.0),
+        ),
+        # Mottled grey, a row of knuckles in place of the dorsal fin. The trainer never draws it: a validation species.
+        Species(
+            "gray",
+            (0.025, 0.05, 0.075, 0.105, 0.15, 0.178, 0.185, 0.17, 0.138, 0.1, 0.065, 0.038, 0.034, 0.03),
+            *(0.27, 0.09, 0.085, 0.25, 0.14, 0.075, 0.0, 0.0),
+            *((96, 98, 98), (170, 176, 178), 0.25, 0.8, 0.1, 12.0),
+        ),
+    )
+}
+
+
+def species_named(name: str) -> Species:
+    """The species `name`; ValueError lists those that there are."""
+    if name not in SPECIES:
+        raise ValueError(f"species {name!r} is not known; there are: {', '.join(SPECIES)}")
+    return SPECIES[name]
+
+
+def with_widths(species: Species, widths: Array) -> Species:
+    """`species` with other full widths, one for each station of STATIONS."""
+    if len(widths) != len(STATIONS):
+        raise ValueError(f"{len(widths)} widths were given, {len(STATIONS)} are needed: one a station")
+    return replace(species, widths=tuple(float(width) for width in widths))
+
+
+def _centreline(stations: Array, bend: float) -> Array:
+    """Sideways offset of the spine: none at the head, growing with the square of the way to the tail."""
+    return bend * np.clip(stations - 0.3, 0, None) ** 2
+
+
+def _to_body(stations: Array, sideways: Array) -> Array:
+    """(N, 2) body coordinates (forward, right), the middle of the body at the origin."""
+    return np.stack([0.5 - stations, sideways], axis=-1)
+
+
+def body_outline(species: Species, bend: float = 0.0, count: int = 25) -> Array:
+    """(2 count, 2) outline of the trunk in body coordinates (forward, right), in body lengths."""
+    stations = np.linspace(0, 1, count) ** 1.2
+    half = np.interp(stations, STATIONS, species.widths) / 2
+    middle = _centreline(stations, bend)
+    left, right = _to_body(stations, middle - half), _to_body(stations, middle + half)
+    return np.concatenate([right, left[::-1]])
+
+
+def fluke_outline(species: Species, bend: float = 0.0, chord_share: float = 1.0) -> Array:
+    """(9, 2) outline of the flukes; `chord_share` below 1 shows them pitched up or down by the stroke."""
+    root, span = 0.985 - species.fluke_chord * chord_share, species.fluke_span / 2
+    sweep = species.fluke_sweep * chord_share
+    stations = np.array([root, root + 0.45 * sweep, root + sweep, root + sweep + 0.012, 0.99])
+    stations = np.maximum.accumulate(stations)
+    sideways = np.array([0.015, 0.55 * span, 0.96 * span, span, 0.45 * span])
+    stations = np.concatenate([stations, [0.975], stations[::-1]])
+    sideways = np.concatenate([sideways, [0.0], -sideways[::-1]])
+    return _to_body(stations, sideways + _centreline(stations, bend))
+
+
+def fin_outlines(species: Species) -> list[Array]:
+    """The two pectoral fins, each (5, 2): swept back from the body's edge."""
+    root, length, chord = species.fin_station, species.fin_length, species.fin_chord
+    edge = float(np.interp(root, STATIONS, species.widths)) / 2 - 0.01
+    stations = np.array([root, root + 0.35 * length, root + 0.75 * length, root + 0.5 * length, root + chord])
+    sideways = edge + np.array([0.0, 0.5, 0.8, 0.35, 0.0]) * length
+    return [_to_body(stations, side * sideways) for side in (1.0, -1.0)]
