@@ -1,0 +1,1 @@
+"""The navigator: what this drone does next, and the setpoint that does it."""
