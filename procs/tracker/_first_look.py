@@ -1,0 +1,138 @@
+"""The first look at an animal: from a point and, if there is one, a detector's box to its models of place and
+colour.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from procs.tracker._appearance import Appearance
+from procs.tracker._body import Body, body_of_box, body_of_weights
+from procs.tracker._sight import Map, Sight, body_patch, segment
+from procs.tracker._window import Window, window_round
+
+__all__ = ["WORKING_LENGTH_PX", "FirstLook", "first_look"]
+
+Array = NDArray[np.float64]
+Image = NDArray[np.uint8]
+
+WORKING_LENGTH_PX = 64.0  # window px: longer bodies are looked at in a reduced picture
+# Without a box: sides of the squares tried round the point, as shares of the frame's height.
+GUESSED_SIDES = (0.08, 0.16, 0.3, 0.5)
+BOX_EDGE = 1.12  # boxes are loose, seldom tight: this far beyond its edge no pixel is thought the animal's
+
+
+@dataclass(frozen=True)
+class FirstLook:
+    """What the first look found; `body` is in frame px, `sight` in the window's."""
+
+    appearance: Appearance
+    window: Window
+    sight: Sight
+    body: Body
+    template: Map
+
+
+def first_look(image: Image, point: Array, box: Array | None, companions: list[Body]) -> FirstLook | None:
+    """Learn the animal at `point` (2,) px, inside `box` (4,) px where one is given; None where nothing stands
+    out.
+    """
+    if box is not None:
+        return _look_in_box(image, point, box, companions)
+    best: FirstLook | None = None
+    best_value = 0.0
+    for share in GUESSED_SIDES:
+        half = share * image.shape[0] / 2
+        look = _look_in_box(image, point, np.concatenate([point - half, point + half]), companions)
+        if look is None:
+            continue
+        value = look.sight.separation * _fits(look.body, point, half)
+        if value > best_value:
+            best, best_value = look, value
+    return best
+
+
+def _fits(body: Body, point: Array, half_px: float) -> float:
+    """How well a guessed square of `half_px` round `point` holds the body: low where it is cut or lost in
+    it.
+    """
+    reach = float(np.max(np.abs(body.box - np.concatenate([point, point])))) / half_px
+    return float(np.clip(2.4 - 1.6 * reach, 0.05, 1)) * float(np.clip(reach / 0.35, 0.2, 1))
+
+
+def _look_in_box(image: Image, point: Array, box: Array, companions: list[Body]) -> FirstLook | None:
+    frame_shape = (image.shape[0], image.shape[1])
+    rough = body_of_box(box)
+    window = window_round(rough.centre, rough.length_px, WORKING_LENGTH_PX / rough.length_px, frame_shape)
+    if window is None:
+        return None
+    pixels = window.cut(image)
+    if float(pixels.std(axis=(0, 1)).max()) < 1.0:
+        return None
+    lab = np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2LAB), dtype=np.uint8)
+    others = [in_window(other, window) for other in companions]
+    prior, outside = _place_prior(window, point, box, others)
+    if int(outside.sum()) < 32:
+        return None
+    appearance = Appearance(lab, prior, outside)
+    sight = _settle(appearance.evidence(lab), prior, in_window(rough, window), others, window, frame_shape)
+    if sight is None:
+        return None
+    template = body_patch(np.ascontiguousarray(lab[..., 0]), sight.body)
+    return FirstLook(appearance, window, sight, in_frame(sight.body, window), template)
+
+
+def _settle(
+    evidence: Map,
+    prior: Map,
+    rough: Body,
+    others: list[Body],
+    window: Window,
+    frame_shape: tuple[int, int],
+) -> Sight | None:
+    """From the box's ellipse to the body's own: moments of the evidence in the box, then of the mask."""
+    weights = np.where(prior > 0.2, np.maximum(evidence, 0) * prior, 0).astype(np.float32)
+    body = body_of_weights(weights, rough.angle_rad)
+    sight = None
+    for _ in range(3):
+        if body is None or body.area_px < 8:
+            return None
+        sight = segment(evidence, body, others, window.open_edges(frame_shape))
+        if sight is None:
+            return None
+        body = sight.body
+    return sight
+
+
+def _place_prior(
+    window: Window, point: Array, box: Array, others: list[Body]
+) -> tuple[Map, NDArray[np.bool_]]:
+    """How likely each window pixel is the animal's by place, and which ones are water for sure."""
+    width, height = window.size
+    centre = window.to_window((box[:2] + box[2:]) / 2)
+    half = (box[2:] - box[:2]) / 2 * window.scale
+    middle = window.to_window(point)
+    u, v = np.arange(width) + 0.5, np.arange(height) + 0.5
+    in_box = np.maximum(np.abs(u - centre[0])[None, :] / half[0], np.abs(v - centre[1])[:, None] / half[1])
+    from_point = np.hypot((u - middle[0])[None, :] / half[0], (v - middle[1])[:, None] / half[1])
+    prior = np.where(in_box < BOX_EDGE, np.clip(0.75 - 0.4 * from_point, 0.05, 0.75), 0)
+    outside = in_box > BOX_EDGE
+    for other in others:
+        radius = other.radius(window.size)
+        prior = np.where(radius < 1, np.minimum(prior, 0.1), prior)
+        outside &= radius > 1.4
+    return prior.astype(np.float32), outside
+
+
+def in_window(body: Body, window: Window) -> Body:
+    """A body in frame px as one in window px."""
+    scaled = body.scaled(window.scale)
+    return Body(window.to_window(body.centre), scaled.length_px, scaled.width_px, body.angle_rad)
+
+
+def in_frame(body: Body, window: Window) -> Body:
+    """A body in window px as one in frame px."""
+    scaled = body.scaled(1 / window.scale)
+    return Body(window.to_frame(body.centre), scaled.length_px, scaled.width_px, body.angle_rad)

@@ -1,0 +1,180 @@
+"""One judged look at a frame: window, evidence, place, mask, score."""
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from procs.tracker._appearance import Appearance
+from procs.tracker._body import Body, body_of_weights
+from procs.tracker._first_look import WORKING_LENGTH_PX, FirstLook, in_window
+from procs.tracker._sight import COMPANION_REACH, Map, Sight, body_patch, likeness, locate, segment
+from procs.tracker._window import Window, window_round
+
+__all__ = ["LEAST_SEPARATION", "Look", "Reference", "find_again", "followed", "take_look"]
+
+Array = NDArray[np.float64]
+Image = NDArray[np.uint8]
+
+LEAST_SEPARATION = 0.12  # of evidence, below which nothing stands out: noise alone reaches about 0.05
+FLAT_LEVELS = 1.0  # grey levels of standard deviation: a covered lens or a dead camera shows less
+WINDOW_MOST_PX = 176.0  # window side: wider searches are done at lower resolution
+LIKENESS_SHARE = 0.2  # of the score; light only, since glints and foam change and a whale rolls
+AREA_SPREAD = 0.5  # of the logarithm of the area: a mask of half or double size keeps 0.4 of its score
+FOUND_LENGTH_PX = 24.0  # window px: the body's length in a search of the whole frame ...
+FOUND_WIDTH_MOST_PX = 320  # ... which is never wider than this
+FOUND_EVIDENCE = 0.2
+FOUND_AREA = (0.35, 2.2)  # times the expected area
+FOUND_TRIED = 6  # largest pieces that are looked at
+
+
+@dataclass
+class Reference:
+    """What the first look promised, moved slowly by good ones: the score compares with it."""
+
+    appearance: Appearance
+    template: Map
+    separation: float
+    area_ratio: float
+
+    @classmethod
+    def of(cls, first: FirstLook) -> "Reference":
+        return cls(first.appearance, first.template, first.sight.separation, first.sight.area_ratio)
+
+
+@dataclass(frozen=True)
+class Look:
+    """`located` and `others` are bodies in window px."""
+
+    window: Window
+    lab: Image
+    evidence: Map
+    located: Body
+    others: list[Body]
+    sight: Sight
+    patch: Map
+    score: float
+
+
+def take_look(
+    image: Image, reference: Reference, body: Body, companions: list[Body], search_px: float
+) -> Look | None:
+    """Look for `body` (frame px) within `search_px` of its place; None where nothing is seen.
+
+    `companions` are the other animals, frame px.
+    """
+    half_px = 0.65 * body.length_px + search_px
+    scale = min(1.0, WORKING_LENGTH_PX / body.length_px, WINDOW_MOST_PX / (2 * half_px))
+    window = window_round(body.centre, half_px, scale, (image.shape[0], image.shape[1]))
+    if window is None:
+        return None
+    pixels = window.cut(image)
+    if float(cv2.meanStdDev(pixels)[1].max()) < FLAT_LEVELS:
+        return None
+    lab = np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2LAB), dtype=np.uint8)
+    others = [in_window(other, window) for other in companions]
+    evidence = reference.appearance.evidence(lab)
+    expected = in_window(body, window)
+    free = _without(evidence, expected, others)
+    located = replace(expected, centre=locate(free, expected, search_px * window.scale))
+    sight = segment(evidence, located, others, window.open_edges((image.shape[0], image.shape[1])))
+    if sight is None or sight.separation < LEAST_SEPARATION:
+        return None
+    patch = body_patch(np.ascontiguousarray(lab[..., 0]), sight.body)
+    return Look(window, lab, evidence, located, others, sight, patch, _score(reference, sight, patch))
+
+
+def _without(evidence: Map, own: Body, others: list[Body]) -> Map:
+    """The evidence with the other animals' pixels made water, so that the ellipse does not slide onto
+    them.
+    """
+    size = (evidence.shape[1], evidence.shape[0])
+    near = [other for other in others if _may_reach(other, size)]
+    if not near:
+        return evidence
+    radius, free = own.radius(size), evidence.copy()
+    for other in near:
+        theirs = other.radius(size)
+        free[(theirs < radius) & (theirs < COMPANION_REACH)] = -0.3
+    return free
+
+
+def _may_reach(other: Body, size: tuple[int, int]) -> bool:
+    reach = COMPANION_REACH * other.length_px / 2
+    return bool(-reach < other.centre[0] < size[0] + reach and -reach < other.centre[1] < size[1] + reach)
+
+
+def _score(reference: Reference, sight: Sight, patch: Map) -> float:
+    """0-1: how far it stands out, times how well the area fits, times a little for its likeness to the first
+    look.
+    """
+    stands_out = min(1.0, sight.separation / (0.8 * reference.separation))
+    off = np.log(max(sight.area_ratio, 1e-3) / reference.area_ratio) / AREA_SPREAD
+    alike = max(0.0, likeness(patch, reference.template, either_way=True))
+    return float(stands_out * np.exp(-0.5 * off * off) * (1 - LIKENESS_SHARE + LIKENESS_SHARE * alike))
+
+
+def followed(look: Look, own: Body) -> list[Body]:
+    """The companions (window px) moved half-way to the evidence that is nearer to them than to `own`."""
+    size = (look.evidence.shape[1], look.evidence.shape[0])
+    own_radius = own.radius(size)
+    moved = []
+    for other in look.others:
+        if not _may_reach(other, size):
+            moved.append(other)
+            continue
+        radius = other.radius(size)
+        theirs = (radius < 1.5) & (radius < own_radius) & (look.evidence > 0)
+        seen = body_of_weights(theirs.astype(np.float32), other.angle_rad)
+        inside = other.area_px * 0.3 < theirs.sum()
+        if seen is None or not inside:
+            moved.append(other)
+            continue
+        turn = 0.3 * (seen.angle_rad - other.angle_rad)
+        moved.append(
+            replace(
+                other,
+                centre=other.centre + 0.5 * (seen.centre - other.centre),
+                angle_rad=other.angle_rad + turn,
+            )
+        )
+    return moved
+
+
+def find_again(image: Image, reference: Reference, body: Body, companions: list[Body]) -> Body | None:
+    """Search the whole frame for a piece with the animal's colours and size; its ellipse in frame px, or
+    None.
+    """
+    height, width = image.shape[:2]
+    scale = min(1.0, FOUND_LENGTH_PX / body.length_px, FOUND_WIDTH_MOST_PX / width)
+    window = Window(0, 0, width, height, (round(width * scale), round(height * scale)))
+    pixels = window.cut(image)
+    if float(cv2.meanStdDev(pixels)[1].max()) < FLAT_LEVELS:
+        return None
+    evidence = reference.appearance.evidence(
+        np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2LAB), dtype=np.uint8)
+    )
+    for other in companions:
+        evidence[in_window(other, window).radius(window.size) < 1.2] = -1
+    _, labels, stats, _ = cv2.connectedComponentsWithStats((evidence > FOUND_EVIDENCE).astype(np.uint8))
+    areas = stats[1:, cv2.CC_STAT_AREA]
+    expected = max(body.area_px * window.scale**2, 4.0)
+    fits = (areas > FOUND_AREA[0] * expected) & (areas < FOUND_AREA[1] * expected)
+    best, best_value = None, 0.0
+    for piece in sorted((np.flatnonzero(fits) + 1).tolist(), key=lambda i: -int(areas[i - 1]))[:FOUND_TRIED]:
+        left, top, wide, high = (int(x) for x in stats[piece, :4])
+        part = (slice(top, top + high), slice(left, left + wide))
+        own = labels[part] == piece
+        seen = body_of_weights(own.astype(np.float32), body.angle_rad)
+        if seen is None:
+            continue
+        seen = replace(seen, centre=seen.centre + np.array([left, top]))
+        off = float(np.log(areas[piece - 1] / expected))
+        long = float(np.log(seen.length_px / (body.length_px * window.scale)))
+        value = float(evidence[part][own].mean()) * float(np.exp(-off * off - 2 * long * long))
+        if value > best_value:
+            best, best_value = seen, value
+    if best is None:
+        return None
+    return replace(body, centre=window.to_frame(best.centre), angle_rad=best.angle_rad)

@@ -1,0 +1,339 @@
+"""Keeps the mask of one animal from frame to frame, without a neural network.
+
+It is the paper's execution step: a mask from the centre of the assigned box, propagated at 20 Hz or more.
+
+Each frame is looked at in a window round the predicted place, at reduced resolution where the animal is
+large:
+1. two colour models, animal and water, say for each pixel how surely it is the animal's;
+2. an ellipse of the animal's size slides over that evidence and settles where it stands out most from its
+ring;
+3. evidence and ellipse give the mask; pixels nearer to another animal's ellipse are that animal's;
+4. how far the mask stands out, its area and its likeness to the first look give the score.
+
+docs/tracking.md explains the choices.
+"""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from procs.tracker._body import Body, body_of_box
+from procs.tracker._checks import (
+    check_boxes,
+    check_companions,
+    check_dt,
+    check_image,
+    check_model,
+    check_motion,
+    check_point,
+)
+from procs.tracker._first_look import FirstLook, first_look, in_frame
+from procs.tracker._look import LEAST_SEPARATION, Look, Reference, find_again, followed, take_look
+from procs.tracker._motion import Motion
+from procs.tracker._sight import Sight, outline_of
+from procs.tracker._window import Window
+
+__all__ = ["MaskTracker", "Track"]
+
+Array = NDArray[np.float64]
+Image = NDArray[np.uint8]
+
+LOST_AFTER_S = 2.0  # unseen for this long, the prediction is worth nothing
+KEEP_SCORE = 0.3  # a tracked animal is seen at this score or above ...
+REGAIN_SCORE = 0.45  # ... one that went unseen needs more ...
+CONFIRM_FRAMES = 3  # ... and a lost one must be found so many times running
+SEARCH_SHARE = 0.4  # of the body's length: an animal moves this far in a frame at most ...
+SEARCH_LEAST_PX = 24.0  # ... and a gust moves the picture by this much
+SEARCH_GROWTH = 0.6  # body lengths a second that the search widens while unseen
+SIZE_RATE = 0.05  # share of the seen size taken over a frame
+SIZE_STEP = 0.012  # a body grows or shrinks by this share a frame at most; a flood grows faster
+TURN_RATE = 0.5  # share of the seen direction taken over a frame
+LEARN_SCORE = 0.6  # the models learn only from looks this good
+LEARN_EVERY = 3  # frames
+LEARN_RATE = 0.03
+WATER_RATE = 0.2  # the water's colour follows the camera's exposure within a second
+STRIKES = 2  # detections running that contradict the mask before they are believed
+OUTLINE_MOST = 64  # corners, what track_t carries
+
+
+@dataclass(frozen=True)
+class Track:
+    """The animal in one frame.
+
+    `mask` (height, width) bool, empty unless `state` is "tracking"; `centre` (2,) px (u, v), the mask's
+    centre or the predicted one, which may lie outside the image; `box` (4,) px left, top, right, bottom;
+    `state` "tracking", "predicted" (unseen for under 2 s) or "lost"; `score` 0-1; `outline` (<= 64, 2) int
+    px; `unseen_s` since it was last really seen.
+    """
+
+    mask: NDArray[np.bool_]
+    centre: Array
+    box: Array
+    state: str
+    score: float
+    outline: NDArray[np.int_]
+    unseen_s: float
+
+
+class MaskTracker:
+    """Tracks one animal: `start` on its box, then `update` with each frame."""
+
+    def __init__(self, model_path: str | Path | None = None) -> None:
+        """`model_path` must be None: ValueError for a path that does not exist, or for a model, which is not
+        supported.
+        """
+        check_model(model_path)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the animal."""
+        self._shape: tuple[int, int] | None = None
+        self._reference: Reference | None = None
+
+    def start(
+        self, image_bgr: Image, point: ArrayLike, box: ArrayLike | None = None, companions: ArrayLike = ()
+    ) -> Track:
+        """Begin on the animal at `point` (2,) px, the centre of its box (paper, Execution).
+
+        `image_bgr` (height, width, 3) uint8; `box` (4,) px if known; `companions` (K, 4) boxes or (K, 2)
+        points of the other animals in view, whose pixels are not this one's. The state is "predicted" where
+        nothing stands out from the water at the point. Raises ValueError on a bad image, point or box.
+        """
+        image = check_image(image_bgr, None)
+        shape = (image.shape[0], image.shape[1])
+        at = check_point(point, shape)
+        own_box = None if box is None else check_boxes(np.asarray(box, dtype=np.float64)[None], "box")[0]
+        others = check_companions(companions)
+        self._shape, self._reference = shape, None
+        self._state, self._score, self._unseen_s = "predicted", 0.0, 0.0
+        self._frames = self._strikes = self._found_running = 0
+        guess = own_box
+        if guess is None:
+            guess = np.concatenate([at, at]) + 0.1 * shape[0] * np.array([-1, -1, 1, 1])
+        self._body = replace(body_of_box(guess), centre=at)
+        self._motion = Motion(at)
+        self._companions = self._as_bodies(others, 0.0)
+        first = first_look(image, at, own_box, self._companions)
+        if first is None or first.sight.separation < LEAST_SEPARATION:
+            return self._unseen_track()
+        return self._adopt(first)
+
+    def update(
+        self,
+        image_bgr: Image,
+        dt_s: float = 0.05,
+        *,
+        boxes: ArrayLike | None = None,
+        boxes_age_s: float = 0.0,
+        companions: ArrayLike | None = None,
+        image_motion: ArrayLike | None = None,
+    ) -> Track:
+        """Follow the animal into the next frame.
+
+        `dt_s` since the frame before; `boxes` (K, 4) px, the detector's fresh boxes of this very animal, seen
+        `boxes_age_s` before this frame; `companions` (K, 4) or (K, 2), fresh places of the others, of the
+        same age (None: carry the known ones on); `image_motion` (3, 3) homography, pixels of the last frame
+        to pixels of this one, from the vehicle's own motion. Raises ValueError on bad input, RuntimeError
+        before `start`.
+        """
+        if self._shape is None:
+            raise RuntimeError("update() before start(): give the tracker its animal first")
+        image = check_image(image_bgr, self._shape)
+        dt = check_dt(dt_s)
+        camera = check_motion(image_motion, self._shape)
+        heard = check_boxes(boxes)
+        others = None if companions is None else check_companions(companions)
+        self._predict(dt, camera)
+        if others is not None:
+            self._companions = self._as_bodies(others, boxes_age_s)
+        retaken = self._hear(image, heard, boxes_age_s) if len(heard) else None
+        track = retaken if retaken is not None else self._see(image, dt)
+        self._motion.remember()
+        return track
+
+    def _predict(self, dt_s: float, camera: Array | None) -> None:
+        self._frames += 1
+        before = self._motion.centre
+        self._motion.predict(dt_s, camera, self._state == "tracking")
+        if camera is not None:
+            self._body = self._body.through(camera)
+            self._companions = [other.through(camera) for other in self._companions]
+        else:
+            # What moves the picture moves all animals; their own motion is slow beside it.
+            step = self._motion.centre - before
+            self._companions = [replace(other, centre=other.centre + step) for other in self._companions]
+        self._body = replace(self._body, centre=self._motion.centre)
+
+    def _as_bodies(self, places: Array, age_s: float) -> list[Body]:
+        """Boxes (K, 4) or points (K, 2) of other animals as ellipses; a point gets this animal's size."""
+        if places.shape[1] == 4:
+            return [body_of_box(self._motion.carried(box, age_s)) for box in places]
+        side = float(np.sqrt(self._body.length_px * self._body.width_px))
+        return [Body(point, side, side, 0.0) for point in places]
+
+    def _hear(self, image: Image, boxes: Array, age_s: float) -> Track | None:
+        """Weigh the detector's boxes against the mask; the new track where they win, else None."""
+        carried = np.array([self._motion.carried(box, age_s) for box in boxes])
+        centres = (carried[:, :2] + carried[:, 2:]) / 2
+        nearest = int(np.argmin(np.hypot(*(centres - self._body.centre).T)))
+        box, centre = carried[nearest], centres[nearest]
+        agrees = _overlap(box, self._body.box) > 0.25
+        if agrees and self._state == "tracking":
+            self._strikes = 0
+            # Boxes are loose: only a size that is far off is drawn towards theirs.
+            factor = float(
+                np.sqrt(np.prod(box[2:] - box[:2]) / np.prod(self._body.box[2:] - self._body.box[:2]))
+            )
+            if not 0.75 < factor < 1.45:
+                self._body = self._body.scaled(factor**0.2)
+            return None
+        self._strikes += 1
+        if self._state == "tracking" and self._strikes < STRIKES:
+            return None
+        height, width = image.shape[:2]
+        inside = np.clip(centre, 0, [width - 1, height - 1])
+        first = first_look(image, inside, box, self._companions)
+        if first is not None and first.sight.separation >= LEAST_SEPARATION:
+            return self._adopt(first)
+        if self._state != "tracking":
+            self._motion.jump(centre)
+            self._body = replace(self._body, centre=centre)
+        return None
+
+    def _adopt(self, first: FirstLook) -> Track:
+        """Take a first look for the truth."""
+        if self._reference is None or self._state == "lost" or not self._near(first.body):
+            self._motion.jump(first.body.centre)
+        else:
+            self._motion.centre = first.body.centre
+        self._body = first.body
+        self._reference = Reference.of(first)
+        self._state, self._score, self._unseen_s = "tracking", 1.0, 0.0
+        self._strikes = self._found_running = 0
+        return self._seen_track(first.window, first.sight)
+
+    def _near(self, body: Body) -> bool:
+        return bool(np.hypot(*(body.centre - self._motion.centre)) < self._body.length_px)
+
+    def _see(self, image: Image, dt_s: float) -> Track:
+        """Look, judge, and move the state on."""
+        look = self._find(image)
+        least = KEEP_SCORE if self._state == "tracking" else REGAIN_SCORE
+        if look is None or look.score < least:
+            self._found_running = 0
+            self._score = 0.0 if look is None else look.score
+            self._unseen_s += dt_s
+            if self._unseen_s >= LOST_AFTER_S:
+                self._state = "lost"
+            elif self._state == "tracking":
+                self._state = "predicted"
+            return self._unseen_track()
+        self._score = look.score
+        self._take_in(look, dt_s)
+        if self._state == "lost":
+            self._unseen_s += dt_s
+            self._found_running += 1
+            if self._found_running < CONFIRM_FRAMES:
+                return self._unseen_track()
+        self._state, self._unseen_s, self._found_running = "tracking", 0.0, 0
+        return self._seen_track(look.window, look.sight)
+
+    def _find(self, image: Image) -> Look | None:
+        """Look round the prediction; a lost animal, in the whole frame."""
+        reference = self._reference
+        if reference is None:
+            return None
+        search = max(SEARCH_LEAST_PX, SEARCH_SHARE * self._body.length_px)
+        if self._state == "lost" and not self._found_running:
+            found = find_again(image, reference, self._body, self._companions)
+            if found is None:
+                return None
+            self._motion.jump(found.centre)
+            self._body = found
+        elif self._state != "lost":
+            search += SEARCH_GROWTH * self._unseen_s * self._body.length_px
+        return take_look(image, reference, self._body, self._companions, search)
+
+    def _take_in(self, look: Look, dt_s: float) -> None:
+        """Place, size, direction, colours and companions after a look that counts."""
+        seen = in_frame(look.sight.body, look.window)
+        if look.sight.cut_by_edge:
+            self._motion.correct(in_frame(look.located, look.window).centre, dt_s)
+        else:
+            self._motion.correct(seen.centre, dt_s)
+            self._body = _eased(self._body, seen)
+        self._body = replace(self._body, centre=self._motion.centre)
+        reference = self._reference
+        if reference is None or self._frames % LEARN_EVERY:
+            return
+        self._companions = [in_frame(other, look.window) for other in followed(look, look.sight.body)]
+        if self._score >= LEARN_SCORE:
+            _learn(reference, look)
+
+    def _seen_track(self, window: Window, sight: Sight) -> Track:
+        assert self._shape is not None
+        columns = np.flatnonzero(sight.mask.any(axis=0))
+        rows = np.flatnonzero(sight.mask.any(axis=1))
+        corners = np.array([[columns[0], rows[0]], [columns[-1] + 1, rows[-1] + 1]], dtype=np.float64)
+        centre = in_frame(sight.body, window).centre if sight.cut_by_edge else self._motion.centre
+        return Track(
+            window.paste(sight.mask, self._shape),
+            centre.copy(),
+            window.to_frame(corners).ravel(),
+            self._state,
+            self._score,
+            np.round(window.to_frame(outline_of(sight.mask, OUTLINE_MOST) + 0.5)).astype(np.int_),
+            self._unseen_s,
+        )
+
+    def _unseen_track(self) -> Track:
+        assert self._shape is not None
+        return Track(
+            np.zeros(self._shape, dtype=np.bool_),
+            self._body.centre.copy(),
+            self._body.box,
+            self._state,
+            self._score,
+            np.zeros((0, 2), dtype=np.int_),
+            self._unseen_s,
+        )
+
+
+def _eased(body: Body, seen: Body) -> Body:
+    """The body with a little of the seen size and more of the seen direction."""
+
+    def towards(old: float, new: float) -> float:
+        return old * float(np.clip((new / old) ** SIZE_RATE, 1 - SIZE_STEP, 1 + SIZE_STEP))
+
+    turn = TURN_RATE * (seen.angle_rad - body.angle_rad) if seen.length_px > 1.2 * seen.width_px else 0.0
+    return Body(
+        body.centre,
+        towards(body.length_px, seen.length_px),
+        towards(body.width_px, seen.width_px),
+        body.angle_rad + turn,
+    )
+
+
+def _learn(reference: Reference, look: Look) -> None:
+    """Move the colour models, the template and the expectations a little towards a good look."""
+    radius = look.sight.body.radius(look.window.size)
+    outside = (radius > 1.5) & ~look.sight.mask
+    for other in look.others:
+        outside &= other.radius(look.window.size) > 1.4
+    if int(outside.sum()) < 64:
+        return
+    inside = look.sight.mask & (radius < 1.1)
+    reference.appearance.follow_water(look.lab, outside, WATER_RATE)
+    reference.appearance.adapt(look.lab, inside, outside, LEARN_RATE)
+    reference.template += np.float32(LEARN_RATE) * (look.patch - reference.template)
+    reference.separation += LEARN_RATE * (look.sight.separation - reference.separation)
+    reference.area_ratio += LEARN_RATE * (look.sight.area_ratio - reference.area_ratio)
+
+
+def _overlap(a: Array, b: Array) -> float:
+    """Intersection over union of two (4,) boxes."""
+    common = float(np.prod(np.maximum(np.minimum(a[2:], b[2:]) - np.maximum(a[:2], b[:2]), 0)))
+    both = float(np.prod(a[2:] - a[:2])) + float(np.prod(b[2:] - b[:2])) - common
+    return common / both
