@@ -40,7 +40,7 @@ CLEARLY_VISIBLE = 0.4  # share of the body in view times its opacity: below this
 class Moment:
     """One frame and the truth about it.
 
-    `box` (4,) px of the watched animal, None while it cannot be seen; `others` (K, 4) px; `pose` the camera's.
+    `box` (4,) px of the watched animal, None while it cannot be seen; `others` (K, 4) px.
     """
 
     image: Image
@@ -89,35 +89,45 @@ def rendered_moments(seed: int, frames: int) -> Iterator[Moment]:
     )
     length_m = rng.uniform(9, 13, 3)
     height_m = float(rng.uniform(25, 100))
-    at = np.array([[0.0, 0.0], [0.0, 0.0], [0.0, 0.0]])
-    at[1:] = rng.uniform(0.45, 1.2, (2, 1)) * length_m[0] * _directions(rng.uniform(0, 2 * np.pi, 2))
-    heading = rng.uniform(0, 2 * np.pi) + rng.normal(0, 0.3, 3)
-    turns = [_wobble(rng, 0.25, 6, 3) for _ in range(3)]
-    speed = rng.uniform(0.8, 2.0, 3)
+    course = float(rng.uniform(0, 2 * np.pi))
+    ahead, beside = _directions(np.array([course, course + np.pi / 2]))
+    # One swims alongside, flippers touching at times; the other a length or two off.
+    at = np.array([[0.0, 0.0], rng.uniform([-0.6, 0.26], [0.6, 0.5]), rng.uniform([-1, -1.4], [1, -0.6])])
+    at = length_m[0] * at @ np.stack([ahead, beside])
+    heading = course + rng.normal(0, 0.06, 3)
+    turn, own_turns = _wobble(rng, 0.25, 6, 3), [_wobble(rng, 0.04, 4, 2) for _ in range(3)]
+    speed = rng.uniform(0.8, 2.0) + rng.normal(0, 0.15, 3)
     roll, pitch, yaw = (_wobble(rng, a, 4, 1.2) for a in (0.08, 0.08, 0.9))
     climb = _wobble(rng, 0.15 * height_m, 8, 5)
     camera_ne = at[0] + rng.normal(0, 2, 2)
     dives = seed % 3 == 2
     for frame in range(frames):
         t_s = frame / RATE_HZ
-        heading = heading + np.array([_at(turn, t_s) for turn in turns]) / RATE_HZ
+        heading = heading + np.array([_at(turn, t_s) + _at(own, t_s) for own in own_turns]) / RATE_HZ
         at = at + speed[:, None] * _directions(heading) / RATE_HZ
         camera_ne = camera_ne + (at[0] - camera_ne) * 0.03
         depth = np.array([_dive_depth(t_s) if dives else 0.0, 0.3, 0.0])
         animals = [
-            AnimalView(i, *at[i], heading[i], length_m[i], species, depth[i], phase_rad=2 * t_s + i)
+            AnimalView(i, at[i, 0], at[i, 1], heading[i], length_m[i], species, depth[i], 2 * t_s + i)
             for i in range(3)
         ]
-        pose = Pose(*camera_ne, -height_m - _at(climb, t_s), _at(roll, t_s), _at(pitch, t_s), _at(yaw, t_s))
+        pose = Pose(
+            camera_ne[0],
+            camera_ne[1],
+            -height_m - _at(climb, t_s),
+            _at(roll, t_s),
+            _at(pitch, t_s),
+            _at(yaw, t_s),
+        )
         labels = sea.labels(CAMERA, pose, animals)
-        own = labels.ids == 0
+        watched = labels.ids == 0
         boxes = labels.boxes.astype(np.float64)
-        visible = float(labels.visible[own][0]) if own.any() else 0.0
+        visible = float(labels.visible[watched][0]) if watched.any() else 0.0
         yield Moment(
             sea.render(CAMERA, pose, t_s, animals),
             pose,
-            boxes[own][0] if own.any() else None,
-            boxes[~own],
+            boxes[watched][0] if watched.any() else None,
+            boxes[~watched],
             visible > CLEARLY_VISIBLE,
         )
 
@@ -314,7 +324,7 @@ def main() -> None:
     data = Path(os.environ.get("PODWATCH_REAL_DATA", Path(__file__).parents[2] / "shared" / "data"))
     pictures = sorted((data / "right_whales" / "images").glob("*.jpg"), key=lambda p: int(p.stem[2:]))
     pictures = [p for p in pictures if int(p.stem[2:]) % 2 == (0 if given.even else 1)][: given.pictures]
-    sequences = [
+    sequences: list[tuple[str, list[tuple[str, int, Path | None]]]] = [
         (
             "rendered",
             [(f"sea_{s}", s, None) for s in range(given.first_seed, given.first_seed + given.seeds)],
@@ -322,7 +332,7 @@ def main() -> None:
         ("photographs", [(p.stem, i, p) for i, p in enumerate(pictures)]),
     ]
     for title, rows in sequences:
-        results = []
+        results: list[Result] = []
         for name, seed, picture in rows:
             moments = (
                 rendered_moments(seed, given.frames)
