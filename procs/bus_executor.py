@@ -33,7 +33,9 @@ def load_driver(spec: DriverSpec) -> Any:
     try:
         factory = getattr(importlib.import_module(module), name)
     except (ImportError, AttributeError) as error:
-        raise RuntimeFailure(f"driver {spec.driver}: cannot be loaded ({error}); check its name in the settings") from error
+        raise RuntimeFailure(
+            f"driver {spec.driver}: cannot be loaded ({error}); check its name in the settings"
+        ) from error
     return factory(**spec.options)
 
 
@@ -71,7 +73,9 @@ class BusRuntime(Runtime):
         spec = self.settings.drivers.get(name)
         if spec is None:
             have = ", ".join(sorted(self.settings.drivers)) or "none"
-            raise RuntimeFailure(f"{self.process}: the settings name no driver for {name!r} (they name: {have})")
+            raise RuntimeFailure(
+                f"{self.process}: the settings name no driver for {name!r} (they name: {have})"
+            )
         return load_driver(spec)
 
     def attach(self, transport: Transport, handler: Callable[[], None]) -> None:
@@ -81,7 +85,9 @@ class BusRuntime(Runtime):
         self._lcm.publish(channel, data)
 
     def _listen(self, subscription: Subscription) -> None:
-        handle = self._lcm.subscribe(subscription.channel, lambda _channel, data: self._arrive(subscription, data))
+        handle = self._lcm.subscribe(
+            subscription.channel, lambda _channel, data: self._arrive(subscription, data)
+        )
         handle.set_queue_capacity(C_QUEUE_CAPACITY)
 
     def _listen_all(self) -> None:
@@ -127,7 +133,9 @@ class BusRuntime(Runtime):
         wait_s = min(max(self._clock.real_seconds((due - self._now) / 1e6), 0.0), LONGEST_WAIT_S)
         if self._next_waiting() is not None:
             wait_s = 0.0
-        self._ready, _, _ = select.select([self._lcm, self._wake_read, *(t for t, _ in self._transports)], [], [], wait_s)
+        self._ready, _, _ = select.select(
+            [self._lcm, self._wake_read, *(t for t, _ in self._transports)], [], [], wait_s
+        )
 
     def _drain(self) -> None:
         """Take everything out of LCM's queue, so that it never fills."""

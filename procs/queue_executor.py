@@ -172,7 +172,10 @@ class QueueRuntime(Runtime):
 
     def _schedule_timer(self, timer: Timer) -> None:
         self._queue.schedule(
-            self._clock.true_us(timer.due_utime), lambda: self._timer_due(timer), drone=self.drone_id, rank=self._rank
+            self._clock.true_us(timer.due_utime),
+            lambda: self._timer_due(timer),
+            drone=self.drone_id,
+            rank=self._rank,
         )
 
     def _timer_due(self, timer: Timer) -> None:

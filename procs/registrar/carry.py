@@ -1,0 +1,144 @@
+"""From the episode's instant to now: the same animal's box from frame to frame, on the ground.
+
+Boxes are followed as points in the drone's own NED frame, so that its own motion drops out. An id given to a box of an
+earlier frame (DESIGN section 4, "from t to now") is then the id of that animal's box in the newest frame.
+"""
+
+from collections import deque
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+
+__all__ = ["BoxCarrier", "Sighting"]
+
+Array = NDArray[np.float64]
+
+KEEP_US = 8_000_000  # frames remembered, and how long an unseen animal is
+GATE_LENGTHS = 0.6
+GATE_SPEED_M_S = 2.0
+MAX_GATE_LENGTHS = 1.2
+VELOCITY_GAIN = 0.15
+MAX_SPEED_M_S = 4.0
+
+
+@dataclass
+class Followed:
+    """One animal that this camera follows."""
+
+    position_m: Array  # (2,) n, e in the drone's own frame
+    utime: int
+    velocity_m_s: Array = field(default_factory=lambda: np.zeros(2))
+    animal: int = -1
+
+    def predict(self, utime: int) -> Array:
+        """(2,) where it should be at `utime`."""
+        return self.position_m + self.velocity_m_s * (utime - self.utime) / 1e6
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """One detected frame: boxes (N, 4) px, ground positions (N, 2) m, and who each box is (index of a followed animal)."""
+
+    utime: int
+    boxes: Array
+    ground_m: Array
+    followed: tuple[Followed, ...]
+
+    @property
+    def ids(self) -> list[int]:
+        """The animal id of each box, -1 where none is known."""
+        return [animal.animal for animal in self.followed]
+
+
+class BoxCarrier:
+    """Associates detections frame to frame and carries ids along."""
+
+    def __init__(self, animal_length_m: float) -> None:
+        self._length_m = animal_length_m
+        self._followed: list[Followed] = []
+        self.sightings: deque[Sighting] = deque()
+
+    def update(self, utime: int, boxes: Array, ground_m: Array) -> Sighting:
+        """Add one detected frame: boxes (N, 4) px and their centres on the ground (N, 2) m, own NED frame."""
+        self._followed = [animal for animal in self._followed if utime - animal.utime <= KEEP_US]
+        matches = self._associate(utime, ground_m)
+        seen: list[Followed] = []
+        for row, position in enumerate(ground_m):
+            animal = matches.get(row)
+            if animal is None:
+                animal = Followed(position.copy(), utime)
+                self._followed.append(animal)
+            else:
+                _move(animal, position, utime)
+            seen.append(animal)
+        sighting = Sighting(utime, boxes, ground_m, tuple(seen))
+        self.sightings.append(sighting)
+        while self.sightings[0].utime < utime - KEEP_US:
+            self.sightings.popleft()
+        return sighting
+
+    def nearest(self, utime: int, within_us: int) -> Sighting | None:
+        """The sighting nearest to `utime`, None where none lies within `within_us`."""
+        if not self.sightings:
+            return None
+        best = min(self.sightings, key=lambda sighting: abs(sighting.utime - utime))
+        return best if abs(best.utime - utime) <= within_us else None
+
+    def name(self, sighting: Sighting, ids: list[int]) -> None:
+        """Give the boxes of an earlier sighting their ids, replacing what was believed; -1 takes a name away."""
+        for animal in self._followed:
+            animal.animal = -1
+        for animal, animal_id in zip(sighting.followed, ids, strict=True):
+            animal.animal = animal_id
+
+    def name_one(self, animal: Followed, animal_id: int) -> None:
+        """Give one followed animal an id; another that held it loses it."""
+        for other in self._followed:
+            if other.animal == animal_id:
+                other.animal = -1
+        animal.animal = animal_id
+
+    def held_ids(self, utime: int, within_us: int) -> list[int]:
+        """Ids of animals seen within `within_us` of `utime`."""
+        return sorted(a.animal for a in self._followed if a.animal >= 0 and utime - a.utime <= within_us)
+
+    def _associate(self, utime: int, ground_m: Array) -> dict[int, Followed]:
+        """Row of `ground_m` -> the followed animal that it is."""
+        if not len(ground_m) or not self._followed:
+            return {}
+        predicted = np.array([animal.predict(utime) for animal in self._followed])
+        unseen_s = np.array([(utime - animal.utime) / 1e6 for animal in self._followed])
+        gate = np.minimum(
+            GATE_LENGTHS * self._length_m + GATE_SPEED_M_S * unseen_s, MAX_GATE_LENGTHS * self._length_m
+        )
+        # An error of the drone's attitude moves all boxes alike: take that common shift out before the last match.
+        shift = np.zeros(2)
+        rows, columns = _match(ground_m, predicted, gate)
+        if len(rows):
+            shift = np.median(ground_m[rows] - predicted[columns], axis=0)
+            rows, columns = _match(ground_m - shift, predicted, gate)
+        return {int(row): self._followed[column] for row, column in zip(rows, columns, strict=True)}
+
+
+def _match(points: Array, predicted: Array, gate: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Pairs (row, column) of least total distance, each within its column's gate (K,) m."""
+    distance = np.linalg.norm(points[:, None] - predicted[None], axis=2)
+    rows, columns = linear_sum_assignment(np.minimum(distance, gate[None] * 2))
+    near = distance[rows, columns] <= gate[columns]
+    return rows[near], columns[near]
+
+
+def _move(animal: Followed, position: Array, utime: int) -> None:
+    dt_s = (utime - animal.utime) / 1e6
+    if dt_s > 0:
+        seen = (position - animal.position_m) / dt_s
+        speed = float(np.linalg.norm(seen))
+        if speed > MAX_SPEED_M_S:
+            seen = seen * MAX_SPEED_M_S / speed
+        animal.velocity_m_s = animal.velocity_m_s + VELOCITY_GAIN * min(dt_s / 0.2, 1.0) * (
+            seen - animal.velocity_m_s
+        )
+    animal.position_m = position.copy()
+    animal.utime = utime
