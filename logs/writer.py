@@ -1,0 +1,143 @@
+"""Writes a drone's bus to an MCAP file: raw LCM bytes, and all that a reader needs to decode them."""
+
+import contextlib
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from mcap.writer import CompressionType, Writer
+
+from lcmtypes import channels
+from logs.exceptions import LogError
+from logs.schemas import fingerprint, lcm_text, type_name
+from logs.sequence import read_head
+
+__all__ = ["ENCODING", "FLUSH_PERIOD_US", "METADATA", "LogWriter", "fresh_path"]
+
+ENCODING = "lcm"  # of messages and of schemas
+METADATA = "podwatch"  # name of the MCAP metadata record that tells whose log it is
+LIBRARY = "podwatch"  # no version: the same messages give the same bytes
+FLUSH_PERIOD_US = 1_000_000  # a killed logger loses at most this much
+CHUNK_BYTES = 4 * 1024 * 1024  # a chunk is closed by time long before
+MAX_CHANNELS = 4096  # MCAP numbers channels with 16 bits; more than this is garbage on the bus, not a fleet
+MAX_TIME_US = (2**63 - 1) // 1000
+
+
+def fresh_path(path: Path) -> Path:
+    """`path`, or where it exists the first free of name.1.mcap, name.2.mcap, ...: nothing is overwritten."""
+    candidate, number = path, 0
+    while candidate.exists():
+        number += 1
+        candidate = path.with_name(f"{path.stem}.{number}{path.suffix}")
+    return candidate
+
+
+class LogWriter:
+    """An MCAP file that is readable up to its last second at any time.
+
+    Each second of log time the chunk is closed and handed to the operating system. The same messages give the
+    same bytes: the file holds no wall clock, no random number and no version of a library.
+
+    Raises LogError: the file exists or cannot be made, a message has no place in MCAP; OSError while writing
+    (disk full, disk gone), after which nothing more can be written.
+    """
+
+    def __init__(
+        self, path: str | os.PathLike[str], *, drone_id: int, metadata: Mapping[str, str] | None = None
+    ):
+        """Make the file. `metadata` (mission, seed ...) is kept in the file's `podwatch` metadata record."""
+        self.path = Path(path)
+        self._drone_id = drone_id
+        self._chunk_start_us: int | None = None
+        self._channel_ids: dict[tuple[str, bool], int] = {}
+        self._schema_ids: dict[str, int] = {}
+        try:
+            self._file = self.path.open("xb")
+        except FileExistsError:
+            raise LogError(
+                f"{path}: exists already and is not overwritten; give a path that is free"
+            ) from None
+        except OSError as error:
+            raise LogError(
+                f"{path}: cannot be made ({error.strerror}); give a path in a folder that may be written"
+            ) from error
+        self._mcap: Any = Writer(self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
+        self._mcap.start(profile="", library=LIBRARY)
+        self._mcap.add_metadata(METADATA, {"drone_id": str(drone_id), **(metadata or {})})
+        self._file.flush()
+
+    @property
+    def n_bytes(self) -> int:
+        """Size of the file so far; the chunk in the making is not in it."""
+        return self._file.tell()
+
+    def write(self, channel: str, data: bytes, utime: int) -> None:
+        """Add one message as it came from the bus; `utime` (us, drone clock) is its log and publish time."""
+        if not 0 <= utime <= MAX_TIME_US:
+            raise LogError(
+                f"{self.path}: utime {utime} us of {channel} lies outside 0 to {MAX_TIME_US}, MCAP's range"
+            )
+        self.flush_due(utime)
+        head = read_head(channel, data)
+        self._mcap.add_message(
+            channel_id=self._channel_id(channel, is_known=head is not None),
+            log_time=utime * 1000,
+            publish_time=utime * 1000,
+            data=data,
+            sequence=head.seq & 0xFFFFFFFF if head else 0,
+        )
+        if self._chunk_start_us is None:
+            self._chunk_start_us = utime
+
+    def flush_due(self, utime: int) -> None:
+        """Flush where a second of log time has passed since the chunk's first message."""
+        start_us = self._chunk_start_us
+        if start_us is not None and abs(utime - start_us) >= FLUSH_PERIOD_US:
+            self.flush()
+
+    def flush(self) -> None:
+        """Close the chunk and hand it to the operating system: what was written outlives this process."""
+        self._mcap.flush()
+        self._chunk_start_us = None
+
+    def close(self) -> None:
+        """Write the summary and close the file; a second call does nothing."""
+        if self._file.closed:
+            return
+        try:
+            self._mcap.finish()
+        finally:
+            self._file.close()
+
+    def abandon(self) -> None:
+        """Close the file without a summary, after a write that failed: whole chunks still read."""
+        with contextlib.suppress(OSError):
+            self._file.close()
+
+    def _channel_id(self, channel: str, *, is_known: bool) -> int:
+        """The MCAP channel of a bus channel; bytes of another type on it go to a channel without a schema."""
+        key = (channel, is_known)
+        if key not in self._channel_ids:
+            if len(self._channel_ids) >= MAX_CHANNELS:
+                raise LogError(
+                    f"{self.path}: {channel} is refused, {MAX_CHANNELS} channels are the limit of a log"
+                )
+            kind = channels.kind_of(channel) if is_known else None
+            metadata = {"drone": str(self._drone_id)}
+            if kind is not None:
+                metadata["fingerprint"] = fingerprint(kind).hex()
+            self._channel_ids[key] = self._mcap.register_channel(
+                topic=channel,
+                message_encoding=ENCODING,
+                schema_id=self._schema_id(kind) if kind else 0,
+                metadata=metadata,
+            )
+        return self._channel_ids[key]
+
+    def _schema_id(self, kind: type) -> int:
+        name = type_name(kind)
+        if name not in self._schema_ids:
+            text = lcm_text(kind).encode("utf-8")
+            self._schema_ids[name] = self._mcap.register_schema(name=name, encoding=ENCODING, data=text)
+        return self._schema_ids[name]

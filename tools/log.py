@@ -1,0 +1,145 @@
+"""`podwatch log`: look into a drone's MCAP log. `info` says what it holds, `cat` prints its messages."""
+
+import sys
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from logs.exceptions import LogError, LogWarning
+from logs.reader import LogInfo, info, read, segments
+
+__all__ = ["app", "describe"]
+
+EXIT_BAD_INPUT = 2
+LONGEST_LIST = 8  # items of a list that `cat` prints; the rest is counted
+LONGEST_RAW = 16  # bytes of undecoded data that `cat` prints
+
+app = typer.Typer(help="Look into a drone's MCAP log.", no_args_is_help=True)
+
+LogPath = Annotated[Path, typer.Argument(help="A drone's .mcap log, as in runs/<time>/.", show_default=False)]
+
+
+@app.command("info")
+def show_info(path: LogPath) -> None:
+    """Say what a log holds: its span, its channels, their rates and sizes, and whether it is whole."""
+    with _clear_errors():
+        log = info(path)
+    console = Console(soft_wrap=True)
+    console.print(_summary(log), markup=False, highlight=False)
+    console.print(_table(log))
+    for problem in log.problems:
+        sys.stderr.write(f"warning: {problem}\n")
+
+
+@app.command("cat")
+def show_messages(
+    path: LogPath,
+    channel: Annotated[
+        list[str] | None, typer.Option("--channel", "-c", help="Only this channel; may be given again.")
+    ] = None,
+    start: Annotated[float, typer.Option(help="First second, counted from the log's first message.")] = 0.0,
+    end: Annotated[
+        float | None, typer.Option(help="Last second, counted alike. [default: the log's end]")
+    ] = None,
+    limit: Annotated[int | None, typer.Option(min=1, help="At most this many messages.")] = None,
+) -> None:
+    """Print a log's messages, one a line: seconds from the log's start, channel, members."""
+    with _clear_errors():
+        if end is not None and end < start:
+            raise LogError(f"--end {end:g} lies before --start {start:g}; give an end of at least the start")
+        start_ns = info(path).start_ns
+        printed = 0
+        for name, log_time_ns, message in read(path, channels=channel or None):
+            at_s = (log_time_ns - start_ns) / 1e9
+            if at_s < start:
+                continue
+            if end is not None and at_s > end:
+                break
+            sys.stdout.write(f"{at_s:12.6f} {name} {describe(message)}\n")
+            printed += 1
+            if printed == limit:
+                break
+
+
+def describe(message: Any) -> str:
+    """A message's members on one line; bytes that did not decode are shown by number and beginning."""
+    if isinstance(message, bytes):
+        return f"{len(message)} bytes {message[:LONGEST_RAW].hex(' ')}"
+    return " ".join(f"{name}={_value(getattr(message, name))}" for name in message.__slots__)
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, bytes):
+        return f"<{len(value)} bytes>"
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if isinstance(value, list | tuple):
+        shown = [_value(item) for item in value[:LONGEST_LIST]]
+        more = len(value) - len(shown)
+        return "[" + ", ".join(shown) + (f", +{more} more" if more else "") + "]"
+    if hasattr(value, "__slots__"):
+        return "(" + describe(value) + ")"
+    return repr(value) if isinstance(value, str) else str(value)
+
+
+def _summary(log: LogInfo) -> str:
+    drone = log.metadata.get("drone_id", "not said")
+    lines = [
+        f"{log.path}",
+        f"drone {drone}, {log.n_messages} messages in {log.span_s:.3f} s, {_size(log.n_bytes)}, "
+        f"{'closed' if log.closed else 'NOT closed'}",
+        f"drone clock {log.start_ns / 1e9:.6f} s to {log.end_ns / 1e9:.6f} s",
+    ]
+    others = [str(segment) for segment in segments(log.path)[1:]]
+    if others:
+        lines.append(f"the logger was restarted; the log goes on in {', '.join(others)}")
+    return "\n".join(lines)
+
+
+def _table(log: LogInfo) -> Table:
+    table = Table()
+    for heading in ("channel", "type"):
+        table.add_column(heading, no_wrap=True)
+    for heading in ("messages", "rate (Hz)", "size", "mean (bytes)", "lost"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    for channel in log.channels:
+        table.add_row(
+            channel.name,
+            channel.type_name or "not known",
+            str(channel.n_messages),
+            f"{channel.rate_hz:.2f}",
+            _size(channel.n_bytes),
+            f"{channel.n_bytes / channel.n_messages:.0f}",
+            "-" if channel.n_lost is None else str(channel.n_lost),
+        )
+    return table
+
+
+def _size(n_bytes: int) -> str:
+    for unit, scale in (("MB", 1e6), ("kB", 1e3)):
+        if n_bytes >= scale:
+            return f"{n_bytes / scale:.1f} {unit}"
+    return f"{n_bytes} bytes"
+
+
+@contextmanager
+def _clear_errors() -> Iterator[None]:
+    """A LogError becomes a line on stderr and exit code 2, a LogWarning a line on stderr."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", LogWarning)
+        warnings.showwarning = _show_warning
+        try:
+            yield
+        except LogError as error:
+            sys.stderr.write(f"{error}\n")
+            raise typer.Exit(EXIT_BAD_INPUT) from None
+
+
+def _show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
+    sys.stderr.write(f"warning: {message}\n")
