@@ -26,7 +26,9 @@ DETECTED_AFTER_US = 450_000  # by then the detector has said what it found at t
 SECOND_LOOK_US = 1_200_000  # a pair's second instant, at least 1 s after the first
 SAID_AFTER_END_US = 1_500_000  # a finished drone repeats its packets, so that the others end too
 SEEN_NOW_US = 1_000_000
-TAKE_UP_LENGTHS = 0.5  # an unnamed box this near to a mapped animal that nobody else here holds is that animal
+TAKE_UP_LENGTHS = (
+    0.5  # an unnamed box this near to a mapped animal that nobody else here holds is that animal
+)
 CORRECTION_GAIN = 0.05
 UPKEEP = -1  # ring_map_t.instant of a packet of the map's upkeep
 
@@ -99,7 +101,9 @@ class Registrar:
         self.finished: Finished | None = None
         self._handled: tuple[int, int] = (0, 0)
 
-    def detected(self, utime: int, boxes: Array, pose: Pose | None, fleet_utime: int) -> tuple[Sighting, dict[int, float]] | None:
+    def detected(
+        self, utime: int, boxes: Array, pose: Pose | None, fleet_utime: int
+    ) -> tuple[Sighting, dict[int, float]] | None:
         """Take one detected frame -> (its sighting, residual in metres to the map by animal id); None without a pose."""
         if pose is None or pose.height_m <= 1.0:
             return None
@@ -191,6 +195,10 @@ class Registrar:
                 focal_px=self._camera.focal_px,
             )
         options = {} if self._register is None else {"register": self._register}
+        memory = None if running.proposal.fresh else self.memory
+        first = running.looks[0].node
+        if instant > 0 and first is not None and first.finished:
+            memory = first.result.memory  # the second look confirms the ids of the first
         look.node = RingNode(
             self._drone_id,
             running.proposal.members,
@@ -199,7 +207,7 @@ class Registrar:
             boxes,
             image_size=self._camera.image_size,
             view=view,
-            memory=None if running.proposal.fresh else self.memory,
+            memory=memory,
             **options,
         )
 
@@ -240,8 +248,12 @@ class Registrar:
         """A pair's proof: both looks give every animal that this camera followed between them the same id."""
         if first.sighting is None or second.sighting is None or first.node is None or second.node is None:
             return False
-        early = dict(zip(map(id, first.sighting.followed), first.node.result.identities.tolist(), strict=True))
-        late = dict(zip(map(id, second.sighting.followed), second.node.result.identities.tolist(), strict=True))
+        early = dict(
+            zip(map(id, first.sighting.followed), first.node.result.identities.tolist(), strict=True)
+        )
+        late = dict(
+            zip(map(id, second.sighting.followed), second.node.result.identities.tolist(), strict=True)
+        )
         both = [key for key in early if key in late and early[key] >= 0 and late[key] >= 0]
         return bool(both) and all(early[key] == late[key] for key in both)
 
@@ -281,7 +293,9 @@ class Registrar:
             if animal.animal >= 0 or not free:
                 continue
             here = self.correction.to_map(position, pose)
-            distance = sorted((float(np.linalg.norm(entry.position_m - here)), entry.animal) for entry in free)
+            distance = sorted(
+                (float(np.linalg.norm(entry.position_m - here)), entry.animal) for entry in free
+            )
             clear = len(distance) == 1 or distance[1][0] > distance[0][0] + TAKE_UP_LENGTHS * self._length_m
             if distance[0][0] <= TAKE_UP_LENGTHS * self._length_m and clear:
                 self.carrier.name_one(animal, distance[0][1])
@@ -306,4 +320,3 @@ class Registrar:
             old = self.correction
             self.correction = Correction(old.n_m + float(n_m), old.e_m + float(e_m), old.yaw_rad)
         return residual
-
