@@ -6,7 +6,7 @@ import difflib
 import json
 import tomllib
 from pathlib import Path
-from typing import Any, ClassVar, Self, TypeVar
+from typing import Any, ClassVar, Literal, Self, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
@@ -56,6 +56,7 @@ class CameraSettings(Section):
 class SearchSettings(Section):
     """Where and how the scout looks."""
 
+    start: Literal["auto", "operator"] = "auto"  # operator: only on the boat's order START
     north_m: float = Field(100.0, ge=-20000, le=20000)
     east_m: float = Field(0.0, ge=-20000, le=20000)
     height_m: float = Field(40.0, ge=5, le=120)
@@ -94,9 +95,13 @@ class LimitSettings(Section):
     @model_validator(mode="after")
     def _ordered(self) -> Self:
         if self.min_height_m >= self.max_height_m:
-            raise ValueError(f"min_height_m {self.min_height_m} must be below max_height_m {self.max_height_m}")
+            raise ValueError(
+                f"min_height_m {self.min_height_m} must be below max_height_m {self.max_height_m}"
+            )
         if self.battery_land >= self.battery_return:
-            raise ValueError(f"battery_land {self.battery_land} must be below battery_return {self.battery_return}")
+            raise ValueError(
+                f"battery_land {self.battery_land} must be below battery_return {self.battery_return}"
+            )
         return self
 
 
@@ -135,11 +140,18 @@ class Mission(Section):
             raise ValueError("drones: at least one [[drones]] entry is needed")
         for drone_id in ids:
             if ids.count(drone_id) > 1:
-                raise ValueError(f"drones: id {drone_id} is given to {ids.count(drone_id)} drones; each needs its own")
-        for name, height_m in (("search.height_m", self.search.height_m), ("watch.height_m", self.watch.height_m)):
+                raise ValueError(
+                    f"drones: id {drone_id} is given to {ids.count(drone_id)} drones; each needs its own"
+                )
+        for name, height_m in (
+            ("search.height_m", self.search.height_m),
+            ("watch.height_m", self.watch.height_m),
+        ):
             if not self.limits.min_height_m <= height_m <= self.limits.max_height_m:
                 low, high = self.limits.min_height_m, self.limits.max_height_m
-                raise ValueError(f"{name} = {height_m} lies outside limits.min_height_m to max_height_m, {low} to {high}")
+                raise ValueError(
+                    f"{name} = {height_m} lies outside limits.min_height_m to max_height_m, {low} to {high}"
+                )
         return self
 
     @property
@@ -193,7 +205,9 @@ def load_mission(path: Path, model: type[S]) -> S:
     try:
         data = tomllib.loads(path.read_text())
     except OSError as error:
-        raise MissionError(f"{path}: cannot be read ({error.strerror}); give the path of a mission file") from error
+        raise MissionError(
+            f"{path}: cannot be read ({error.strerror}); give the path of a mission file"
+        ) from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise MissionError(f"{path}: not valid TOML: {error}") from error
     return validate(data, model, str(path))
@@ -204,7 +218,9 @@ def validate(data: dict[str, Any], model: type[S], source: str) -> S:
     try:
         return model.model_validate(data)
     except ValidationError as error:
-        raise MissionError(f"{source}: " + "; ".join(_explain(item, model) for item in error.errors())) from None
+        raise MissionError(
+            f"{source}: " + "; ".join(_explain(item, model) for item in error.errors())
+        ) from None
 
 
 def _explain(item: Any, model: type[BaseModel]) -> str:
@@ -212,7 +228,11 @@ def _explain(item: Any, model: type[BaseModel]) -> str:
     if item["type"] == "extra_forbidden":
         valid = _valid_keys(model, item["loc"][:-1])
         near = difflib.get_close_matches(str(item["loc"][-1]), valid, n=1, cutoff=0.0)
-        return f"unknown key {where!r}" + (f"; did you mean {near[0]!r}?" if near else "") + f" Valid: {', '.join(valid)}"
+        return (
+            f"unknown key {where!r}"
+            + (f"; did you mean {near[0]!r}?" if near else "")
+            + f" Valid: {', '.join(valid)}"
+        )
     message = item["msg"].removeprefix("Value error, ")
     value = item.get("input")
     shown = "" if isinstance(value, dict | BaseModel) else f" (given: {value!r})"

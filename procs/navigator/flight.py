@@ -9,13 +9,15 @@ __all__ = ["approach", "inside_fence", "limited"]
 
 Array = NDArray[np.float64]
 
-GAIN_PER_S = 0.6  # velocity per metre of distance: a first-order approach in 1.7 s, slower than the autopilot's own loop
+# Velocity per metre of distance: a first-order approach in 1.7 s, slower than the autopilot's own loop
+GAIN_PER_S = 0.6
 BRAKING_M_S2 = 1.2
 ACCELERATION_M_S2 = 2.5
 
 
 def approach(own_ned: Array, goal_ned: Array, speed_m_s: float, feed_ned: Array | None = None) -> Array:
-    """Velocity (3,) towards `goal_ned` that slows down in time to stop there, plus the goal's own velocity `feed_ned`.
+    """Velocity (3,) towards `goal_ned` that slows down in time to stop there, plus the goal's own velocity
+    `feed_ned`.
 
     The horizontal part keeps to `speed_m_s`; the vertical part is limited later, by `limited`.
     """
@@ -29,7 +31,9 @@ def approach(own_ned: Array, goal_ned: Array, speed_m_s: float, feed_ned: Array 
 
 
 def inside_fence(goal_ned: Array, limits: LimitSettings) -> Array:
-    """`goal_ned` (3,) moved to the nearest place inside the fence and between the lowest and the highest height."""
+    """`goal_ned` (3,) moved to the nearest place inside the fence and between the lowest and the highest
+    height.
+    """
     goal = np.array(goal_ned, dtype=np.float64)
     reach_m = float(np.linalg.norm(goal[:2]))
     # 3 m inside: an autopilot's own fence must not be touched (AUTOPILOT fact 11).
@@ -43,8 +47,8 @@ def inside_fence(goal_ned: Array, limits: LimitSettings) -> Array:
 def limited(velocity: Array, previous: Array, own_ned: Array, dt_s: float, limits: LimitSettings) -> Array:
     """`velocity` (3,) inside the limits of speed, climb, descent, acceleration, fence and height; (3,).
 
-    `previous` is the velocity that was last asked for, `dt_s` ago. The limits that keep the drone in its volume come last:
-    they may brake harder than the acceleration limit.
+    `previous` is the velocity that was last asked for, `dt_s` ago. The limits that keep the drone in its
+    volume come last: they may brake harder than the acceleration limit.
     """
     change = np.asarray(velocity, dtype=np.float64) - previous
     size = float(np.linalg.norm(change))

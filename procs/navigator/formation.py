@@ -1,4 +1,6 @@
-"""Places of a fleet in the air: the gathering circle, the layers of heights, and keeping clear of each other."""
+"""Places of a fleet in the air: the gathering circle, the layers of heights, and keeping clear of each
+other.
+"""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,9 +31,11 @@ def gather_height(
     highest_m: float,
     tilt_margin_rad: float = float(TILT_MARGIN_RAD),
 ) -> float:
-    """Height from which every drone of the circle sees the whole pod, clamped to [lowest_m, highest_m] (DESIGN section 5).
+    """Height from which every drone of the circle sees the whole pod, clamped to [lowest_m, highest_m]
+    (DESIGN section 5).
 
-    The lowest of the circle's layers stands here; the others stand at most 15 % above it, and none above highest_m.
+    The lowest of the circle's layers stands here; the others stand at most 15 % above it, and none above
+    highest_m.
     """
     half_rad = vfov_rad / 2 - tilt_margin_rad
     if half_rad <= 0:
@@ -55,7 +59,9 @@ def slot(
 
 
 def layer_heights(n: int, lowest_m: float, highest_m: float, step_m: float = 5.0, most: int = 4) -> Array:
-    """(n,) heights by rank: up to `most` layers `step_m` apart from lowest_m, closer together where highest_m is near."""
+    """(n,) heights by rank: up to `most` layers `step_m` apart from lowest_m, closer together where
+    highest_m is near.
+    """
     layers = max(1, min(n, most))
     top_m = min(highest_m, lowest_m + step_m * (layers - 1))
     heights = np.linspace(min(lowest_m, top_m), top_m, layers)
@@ -71,11 +77,13 @@ def separate(
     clearance_m: float,
     max_growth_m: float = 4.0,
 ) -> Array:
-    """The velocity nearest to `velocity_ned` (3,) that keeps `clearance_m` from each other drone, in three dimensions.
+    """The velocity nearest to `velocity_ned` (3,) that keeps `clearance_m` from each other drone, in three
+    dimensions.
 
-    others_ned, others_velocity_ned: (K, 3) as last heard, `ages_s` (K,) ago. Each place is carried forward and its clearance
-    grown by speed x age (at most max_growth_m). The closing speed may not exceed 0.7/s of the distance left; what
-    that takes away is given back to the right-hand side, so that two drones that meet head on pass each other.
+    others_ned, others_velocity_ned: (K, 3) as last heard, `ages_s` (K,) ago. Each place is carried forward
+    and its clearance grown by speed x age (at most max_growth_m). The closing speed may not exceed 0.7/s of
+    the distance left; what that takes away is given back to the right-hand side, so that two drones that
+    meet head on pass each other.
     """
     result = np.array(velocity_ned, dtype=np.float64)
     predicted_ned = others_ned + others_velocity_ned * ages_s[:, None]

@@ -1,4 +1,6 @@
-"""Is a pod in view, and where is its middle: the presence gate and the filtered barycentre (paper, Scouting)."""
+"""Is a pod in view, and where is its middle: the presence gate and the filtered barycentre (paper,
+Scouting).
+"""
 
 from collections import deque
 
@@ -13,7 +15,8 @@ Array = NDArray[np.float64]
 class PresenceGate:
     """Present when at least `share` of the last `frames` frames had detections; hysteresis on both edges.
 
-    It opens only on a full buffer at `share` and closes only when the share falls below `share` - `hysteresis`.
+    It opens only on a full buffer at `share` and closes only when the share falls below `share` -
+    `hysteresis`.
     """
 
     def __init__(self, frames: int, share: float, hysteresis: float = 0.3) -> None:
@@ -52,7 +55,9 @@ class Barycentre:
         self.radius_m = 0.0
 
     def update(self, points_ne: Array, margin_m: float = 0.0) -> None:
-        """Take one frame's animals, (N, 2) on the ground; `margin_m` (half a body) is added to the radius. N = 0 changes nothing."""
+        """Take one frame's animals, (N, 2) on the ground; `margin_m` (half a body) is added to the radius. N
+        = 0 changes nothing.
+        """
         if len(points_ne) == 0:
             return
         middle = points_ne.mean(axis=0)
@@ -61,7 +66,8 @@ class Barycentre:
         else:
             self.centre_ne = self.centre_ne + self.gain * (middle - self.centre_ne)
         reach_m = float(np.linalg.norm(points_ne - self.centre_ne, axis=1).max()) + margin_m
-        # The radius follows a growth at once and a shrinking slowly: an animal that dives is still of the pod.
+        # The radius follows a growth at once and a shrinking slowly: an animal that dives is still of the
+        # pod.
         self.radius_m = max(reach_m, self.radius_decay * self.radius_m)
 
     def start_at(self, centre_ne: Array, radius_m: float) -> None:

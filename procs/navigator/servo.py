@@ -1,7 +1,7 @@
 """The visual servo: from the tracked animal's pixels to a velocity that keeps it in the middle of the image.
 
-The pixel is projected to the ground with the pose that the drone had when the frame was taken, so that tilt does
-not look like motion of the animal; an alpha-beta filter carries place and velocity over gaps.
+The pixel is projected to the ground with the pose that the drone had when the frame was taken, so that tilt
+does not look like motion of the animal; an alpha-beta filter carries place and velocity over gaps.
 """
 
 from collections import deque
@@ -23,7 +23,9 @@ MAX_RANGE_HEIGHTS = (
 
 
 class PoseHistory:
-    """The drone's poses of the last seconds, so that a frame is projected with the pose of its own instant."""
+    """The drone's poses of the last seconds, so that a frame is projected with the pose of its own
+    instant.
+    """
 
     def __init__(self, keep: int = 60) -> None:
         self._times_us: deque[int] = deque(maxlen=keep)
@@ -54,7 +56,9 @@ class PoseHistory:
 
 
 def ground_points(camera: Pinhole, pose: Pose, pixels: Array) -> Array:
-    """(M, 2) north, east of the pixels (N, 2) that show ground; M < N where some lie near or over the horizon."""
+    """(M, 2) north, east of the pixels (N, 2) that show ground; M < N where some lie near or over the
+    horizon.
+    """
     pixels = np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
     if pose.height_m < MIN_HEIGHT_M or len(pixels) == 0:
         return np.zeros((0, 2))
@@ -80,7 +84,9 @@ class AnimalFilter:
         self.seen_us = 0
 
     def update(self, utime: int, point_ne: Array) -> None:
-        """Take one sight of the animal, (2,) on the ground, at `utime` us; an older one than the last is left out."""
+        """Take one sight of the animal, (2,) on the ground, at `utime` us; an older one than the last is
+        left out.
+        """
         if self.ne is None or (utime - self.seen_us) * 1e-6 > 5.0:
             self.ne, self.velocity_ne, self.seen_us = np.array(point_ne, dtype=np.float64), np.zeros(2), utime
             return
@@ -97,7 +103,9 @@ class AnimalFilter:
         self.seen_us = utime
 
     def at(self, utime: int, fade_s: float = 4.0) -> Array | None:
-        """(2,) where the animal should be at `utime`; carried on for `fade_s` at most, then it stays there."""
+        """(2,) where the animal should be at `utime`; carried on for `fade_s` at most, then it stays
+        there.
+        """
         if self.ne is None:
             return None
         return self.ne + self.velocity_ne * float(np.clip((utime - self.seen_us) * 1e-6, 0, fade_s))
@@ -111,7 +119,9 @@ class AnimalFilter:
 def servo_velocity(
     own_ned: Array, animal_ne: Array, animal_velocity_ne: Array, height_m: float, speed_m_s: float
 ) -> Array:
-    """Velocity (3,) that brings the drone over the animal and keeps it there: its own speed fed forward, height held."""
+    """Velocity (3,) that brings the drone over the animal and keeps it there: its own speed fed forward,
+    height held.
+    """
     goal = np.array([animal_ne[0], animal_ne[1], -height_m])
     velocity = approach(
         own_ned, goal, speed_m_s, np.array([animal_velocity_ne[0], animal_velocity_ne[1], 0.0])

@@ -9,7 +9,9 @@ Array = NDArray[np.float64]
 
 
 def spacing_for(height_m: float, vfov_rad: float, overlap: float = 0.3) -> float:
-    """Distance between turns so that the image's short side (its height) covers them with `overlap` (0 to below 1)."""
+    """Distance between turns so that the image's short side (its height) covers them with `overlap` (0 to
+    below 1).
+    """
     if not 0 <= overlap < 1:
         raise ValueError(f"overlap {overlap} must be at least 0 and below 1")
     return 2 * height_m * float(np.tan(vfov_rad / 2)) * (1 - overlap)
@@ -18,8 +20,8 @@ def spacing_for(height_m: float, vfov_rad: float, overlap: float = 0.3) -> float
 def spiral(centre_ne: Array, spacing_m: float, radius_m: float) -> Array:
     """(K, 2) waypoints north, east of an Archimedean spiral round `centre_ne`, turns `spacing_m` apart.
 
-    The first is the centre and the last lies at `radius_m`; neighbours are at most `spacing_m` and a sixth of a turn apart.
-    Raises ValueError for a spacing or a radius that is not above 0.
+    The first is the centre and the last lies at `radius_m`; neighbours are at most `spacing_m` and a sixth
+    of a turn apart. Raises ValueError for a spacing or a radius that is not above 0.
     """
     if not (spacing_m > 0 and radius_m > 0):
         raise ValueError(f"spacing {spacing_m} m and radius {radius_m} m must both be above 0")

@@ -1,6 +1,7 @@
 """The mission's states and the one table of the steps between them (DESIGN section 5).
 
-The navigator can change state only through `next_state`, and docs/navigator.md draws `diagram()`: a test compares the two.
+The navigator can change state only through `next_state`, and docs/navigator.md draws `diagram()`: a test
+compares the two.
 """
 
 from dataclasses import dataclass
@@ -150,7 +151,9 @@ def next_state(state: State, event: Event) -> State | None:
 
 
 def diagram() -> str:
-    """The table as a Mermaid state diagram; a rule that holds in a whole group is drawn once, from the group."""
+    """The table as a Mermaid state diagram; a rule that holds in a whole group is drawn once, from the
+    group.
+    """
     groups = {FLYING: "FLYING", AT_WORK: "AT_WORK"}
     lines = ["stateDiagram-v2", "    [*] --> IDLE", "    state FLYING {", "        state AT_WORK {"]
     lines += [f"            {state.name}" for state in AT_WORK]

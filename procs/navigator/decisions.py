@@ -1,0 +1,77 @@
+"""What overrides every behaviour: the pilot, the boat's orders, the battery, doubt, and the end of the
+watch.
+"""
+
+from lcmtypes import podwatch
+from procs.navigator.situation import Memory, Situation
+from procs.navigator.states import Event, State
+
+__all__ = ["overriding_events", "pilot_has_it"]
+
+OWN_MODES = (
+    6,
+    9,
+    17,
+)  # ArduCopter RTL, LAND, BRAKE: the bridge's or the autopilot's own doing, not a pilot's
+WATCH_MARGIN_S = (
+    2.0  # so that every drone's watch covers what was asked, though their clocks start a second apart
+)
+_GOING_HOME = (State.RETURN, State.LAND, State.LANDED)
+
+
+def pilot_has_it(now: Situation) -> bool:
+    """In the air and not guided: somebody else flies."""
+    vehicle = now.inputs.vehicle
+    return (
+        vehicle is not None
+        and now.vehicle_fresh
+        and not vehicle.guided
+        and not vehicle.landed
+        and vehicle.flight_mode not in OWN_MODES
+    )
+
+
+def overriding_events(now: Situation, memory: Memory) -> list[Event]:
+    """Events that hold now, the weightiest first; the table says which of them lead anywhere from the
+    present state.
+    """
+    operator = podwatch.operator_t
+    vehicle, limits = now.inputs.vehicle, now.mission.limits
+    down = vehicle is not None and now.vehicle_fresh and vehicle.landed and not vehicle.armed
+    if down and memory.state in (State.RETURN, State.LAND, State.HOLD):
+        return [Event.TOUCHED_DOWN]
+    if pilot_has_it(now):
+        return [Event.PILOT]  # the pilot's stick always wins: no order, no battery moves the drone
+    events = []
+    if vehicle is not None and vehicle.battery < limits.battery_land:
+        events.append(Event.BATTERY_EMPTY)
+    if now.command == operator.LAND:
+        events.append(Event.ORDER_LAND)
+    on_ground = vehicle is not None and vehicle.landed and memory.state == State.TAKEOFF
+    if on_ground:
+        return events
+    if not now.vehicle_ok or down:
+        return [*events, Event.DOUBT]
+    if vehicle is not None and vehicle.battery < limits.battery_return:
+        return [*events, Event.BATTERY_LOW]
+    if now.command == operator.RETURN:
+        events.append(Event.ORDER_RETURN)
+    if now.command == operator.HOLD:
+        events.append(Event.ORDER_HOLD)
+    if memory.watch_since_us and (
+        now.seconds_since(memory.watch_since_us) > now.mission.watch.watch_s + WATCH_MARGIN_S
+    ):
+        events.append(Event.WATCHED)
+    if _fleet_returns(now, memory):
+        events.append(Event.FLEET_RETURNS)
+    return events
+
+
+def _fleet_returns(now: Situation, memory: Memory) -> bool:
+    """All others go home, and not for want of charge: the watch is over, though this drone may not know
+    since when.
+    """
+    if memory.find is None or not now.others or (memory.state == State.MONITOR and not memory.resumed):
+        return False
+    charged = [row for row in now.others if row.battery > now.mission.limits.battery_return + 0.02]
+    return bool(charged) and all(row.state in _GOING_HOME for row in now.others)

@@ -1,0 +1,121 @@
+"""MONITOR: over its own animal, by sight where it has it, else by prediction, else by the fleet's map."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.cameras.pinhole import Pinhole
+from lcmtypes import podwatch
+from procs.navigator.behaviours import fly_to
+from procs.navigator.servo import ground_points, servo_velocity
+from procs.navigator.situation import Memory, Situation, Step, episode_key
+from procs.navigator.states import Event, State
+
+__all__ = ["conflict", "follow_assignment", "look", "monitor"]
+
+Array = NDArray[np.float64]
+
+BLIND_S = 3.0  # unseen for so long: the map knows better than the prediction
+GIVE_UP_S = 40.0  # twice a dive of 20 s
+WIDEN_M_S = 0.7  # climb while the animal is not seen
+WIDEN_MOST_M = 10.0
+CONFLICT_S = 4.0
+MAX_CONFLICTS = 3  # gathering again more often than that would cost more than it mends
+LAYERS = 3
+
+
+def follow_assignment(now: Situation, memory: Memory) -> Event | None:
+    """Take the animal of a newer certificate; SURPLUS where it gives none."""
+    assignment = now.inputs.assignment
+    if assignment is None or not assignment.certified or episode_key(assignment) <= memory.assigned_key:
+        return None
+    memory.assigned_key = episode_key(assignment)
+    if assignment.animal < 0:
+        return Event.SURPLUS if assignment.surplus else None
+    if assignment.animal != memory.animal:
+        memory.animal = assignment.animal
+        memory.animal_filter.reset()
+        memory.seen_us = now.utime
+    return None
+
+
+def look(now: Situation, memory: Memory, camera: Pinhole) -> None:
+    """Take the tracker's newest sight of the own animal into the filter."""
+    track = now.inputs.track
+    if track is None or track.animal != memory.animal or track.state != podwatch.track_t.TRACKING:
+        return
+    pose = memory.poses.at(track.utime)
+    if track.utime <= memory.animal_filter.seen_us or pose is None:
+        return
+    points = ground_points(camera, pose, np.array([[track.u_px, track.v_px]]))
+    if len(points):
+        memory.animal_filter.update(track.utime, points[0])
+        memory.seen_us = track.utime
+
+
+def conflict(now: Situation, memory: Memory) -> bool:
+    """Two drones over one animal, or the own animal away from its place in the map, for longer than 4 s."""
+    length_m = now.mission.watch.animal_length_m
+    own = memory.animal_filter.at(now.utime)
+    entry = now.map_entry(memory.animal)
+    doubted = entry is not None and entry.mine and entry.residual_m > length_m
+    for row in now.others:
+        if row.state != State.MONITOR or row.animal < 0:
+            continue
+        if row.animal == memory.animal:
+            doubted = True
+            continue
+        theirs = now.map_position(row.animal)
+        mine = now.map_position(memory.animal)
+        # Two animals that swim side by side are no conflict: the map says whether they do.
+        apart = theirs is None or mine is None or float(np.linalg.norm(theirs - mine)) > length_m
+        near = own is not None and float(np.linalg.norm(own - [row.n_m, row.e_m])) < length_m / 2
+        doubted = doubted or (near and apart and now.row_age_s(row) < 2.0)
+    if not doubted:
+        memory.conflict_since_us = 0
+    elif memory.conflict_since_us == 0:
+        memory.conflict_since_us = now.utime
+    lasted = memory.conflict_since_us > 0 and now.seconds_since(memory.conflict_since_us) > CONFLICT_S
+    # Of two drones with the same animal one must go: whose id is higher. Both gather where the places clash.
+    return lasted and memory.n_conflicts < MAX_CONFLICTS
+
+
+def monitor(now: Situation, memory: Memory, camera: Pinhole) -> Step:
+    """Servo over the own animal; not seen: predict, then the map, wider; only after 40 s back to the
+    circle.
+    """
+    event = follow_assignment(now, memory)
+    look(now, memory, camera)
+    if memory.seen_us == 0:
+        memory.seen_us = now.utime
+    unseen_s = now.seconds_since(memory.seen_us)
+    step = _over_animal(now, memory, unseen_s)
+    if now.command == podwatch.operator_t.LEAVE and _told_to_leave(now, memory):
+        event = Event.LEAVE
+    elif unseen_s > GIVE_UP_S:
+        event = Event.ANIMAL_LOST
+    elif conflict(now, memory):
+        memory.n_conflicts += 1
+        event = Event.CONFLICT
+    step.event = event
+    return step
+
+
+def _told_to_leave(now: Situation, memory: Memory) -> bool:
+    return now.inputs.fleet is not None and now.inputs.fleet.order.animal == memory.animal
+
+
+def _over_animal(now: Situation, memory: Memory, unseen_s: float) -> Step:
+    watch = now.mission.watch
+    wider_m = float(np.clip((unseen_s - BLIND_S) * WIDEN_M_S, 0, WIDEN_MOST_M))
+    height_m = min(now.layer(watch.height_m, LAYERS) + wider_m, now.mission.limits.max_height_m)
+    sight = memory.animal_filter.at(now.utime)
+    if sight is not None and unseen_s <= BLIND_S:
+        drift = memory.animal_filter.velocity_ne
+        velocity = servo_velocity(now.position, sight, drift, height_m, watch.speed_m_s)
+        goal = np.array([sight[0], sight[1], -height_m])
+        return Step(velocity=velocity, goal=goal, cause_utime=memory.seen_us)
+    place = now.map_position(memory.animal)
+    if place is None:
+        place = sight if sight is not None else now.position[:2]
+    goal = np.array([place[0], place[1], -height_m])
+    return fly_to(now, goal, watch.speed_m_s, climbs_first=False)

@@ -1,0 +1,250 @@
+"""What the navigator hears, what it says, what it remembers, and how one moment looks through the mission's
+eyes.
+"""
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from lcmtypes import podwatch
+from procs.navigator.formation import layer_heights
+from procs.navigator.presence import Barycentre, PresenceGate
+from procs.navigator.servo import AnimalFilter, PoseHistory
+from procs.navigator.states import IN_CIRCLE, Event, State
+from procs.settings import Mission
+
+__all__ = ["Find", "Inputs", "Memory", "Outputs", "Situation", "Step", "episode_key"]
+
+Array = NDArray[np.float64]
+EpisodeKey = tuple[int, int]
+
+VEHICLE_LIMIT_S = 1.0  # an older vehicle state is doubt
+LINK_LIMIT_S = 2.0  # the autopilot's own heartbeat comes at 1 Hz
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """The newest of everything at `utime` (us, drone clock); None where nothing was heard yet."""
+
+    utime: int
+    vehicle: podwatch.vehicle_state_t | None = None
+    detections: podwatch.detections_t | None = None
+    identities: podwatch.identities_t | None = None
+    assignment: podwatch.assignment_t | None = None
+    track: podwatch.track_t | None = None
+    fleet: podwatch.fleet_state_t | None = None
+
+
+@dataclass(frozen=True)
+class Outputs:
+    """One setpoint, and the mission state; None while a restarted navigator still listens for its own last
+    one.
+    """
+
+    setpoint: podwatch.setpoint_t
+    mission: podwatch.mission_state_t | None
+
+
+@dataclass(frozen=True)
+class Find:
+    """A pod: its middle on the ground (2,) north, east, its radius and its drift (2,) in m/s."""
+
+    ne: Array
+    radius_m: float
+    drift_ne: Array = field(default_factory=lambda: np.zeros(2))
+
+
+@dataclass
+class Step:
+    """What a behaviour wants: to fly `velocity` (3,) (None: hold by the autopilot) towards `goal` (3,), or
+    an event.
+    """
+
+    velocity: Array | None = None
+    goal: Array | None = None
+    kind: int = podwatch.setpoint_t.VELOCITY
+    event: Event | None = None
+    on_station: bool = False
+    wants_episode: bool = False
+    cause_utime: int = 0
+
+
+@dataclass
+class Memory:
+    """All that the navigator carries from one update to the next."""
+
+    gate: PresenceGate
+    barycentre: Barycentre
+    animal_filter: AnimalFilter
+    find_filter: AnimalFilter
+    poses: PoseHistory = field(default_factory=PoseHistory)
+    state: State = State.IDLE
+    since_us: int = 0
+    reason: str = "waits for the mission to begin"
+    yaw_rad: float | None = None  # the heading at the first word of the autopilot; kept through the flight
+    waypoint: int = 0  # last reached by any scout
+    target_waypoint: int | None = None
+    find: Find | None = None
+    animal: int = -1
+    surplus: bool = False
+    gather_key: EpisodeKey = (0, 0)  # newest episode that had ended when this gathering began
+    gather_since_us: int = 0
+    station_since_us: int = 0  # 0 while off station
+    station_error_m: float = 0.0  # low-pass: one noisy position must not push a drone off its station
+    agreed_key: EpisodeKey = (0, 0)
+    assigned_key: EpisodeKey = (0, 0)
+    seen_us: int = 0  # capture time of the last sight of the own animal
+    conflict_since_us: int = 0
+    n_conflicts: int = 0
+    detections_us: int = 0  # capture time of the newest detections that were taken in
+    first_watch_us: int = 0  # when the first drone was seen in MONITOR, 0 while none is
+    watch_since_us: int = 0  # when the fleet began MONITOR, 0 before
+    held_us: int = 0  # last instant of doubt
+    pilot_us: int = 0  # last instant at which the pilot had it
+    resumed: bool = False  # started in flight: it does not know since when the fleet watches
+    hold_ned: Array | None = None
+    resume: Event = Event.TO_STANDBY
+    start_order_us: int = 0  # utime of the START order that was already obeyed
+
+
+def episode_key(message: podwatch.identities_t | podwatch.assignment_t | None) -> EpisodeKey:
+    """(number, proposer) of the newest ended episode; the larger is the newer (DESIGN section 4)."""
+    if message is None:
+        return (0, 0)
+    if isinstance(message, podwatch.identities_t):
+        return (message.episode, message.episode_proposer)
+    return (message.episode, message.proposer)
+
+
+@dataclass(frozen=True)
+class Situation:
+    """One moment: the inputs with their ages judged, and the fleet as this drone sees it."""
+
+    mission: Mission
+    drone_id: int
+    inputs: Inputs
+    memory: Memory
+
+    @property
+    def utime(self) -> int:
+        return self.inputs.utime
+
+    def seconds_since(self, utime: int) -> float:
+        return (self.inputs.utime - utime) * 1e-6
+
+    @property
+    def in_state_s(self) -> float:
+        return self.seconds_since(self.memory.since_us)
+
+    @property
+    def vehicle_fresh(self) -> bool:
+        vehicle = self.inputs.vehicle
+        return vehicle is not None and self.seconds_since(vehicle.utime) <= VEHICLE_LIMIT_S
+
+    @property
+    def vehicle_ok(self) -> bool:
+        """The vehicle's state is fresh, its link alive and its position good: it may be flown on
+        setpoints.
+        """
+        vehicle = self.inputs.vehicle
+        return (
+            vehicle is not None
+            and self.vehicle_fresh
+            and vehicle.position_ok
+            and vehicle.link_age_ms <= LINK_LIMIT_S * 1e3
+            and bool(np.isfinite([vehicle.n_m, vehicle.e_m, vehicle.d_m]).all())
+        )
+
+    @cached_property
+    def position(self) -> Array:
+        """(3,) NED, carried forward by the age of the vehicle's state; zeros before the first."""
+        vehicle = self.inputs.vehicle
+        if vehicle is None:
+            return np.zeros(3)
+        age_s = min(max(self.seconds_since(vehicle.utime), 0.0), VEHICLE_LIMIT_S)
+        return np.array([vehicle.n_m, vehicle.e_m, vehicle.d_m], dtype=np.float64) + self.velocity * age_s
+
+    @cached_property
+    def velocity(self) -> Array:
+        vehicle = self.inputs.vehicle
+        return (
+            np.zeros(3)
+            if vehicle is None
+            else np.array([vehicle.vn_m_s, vehicle.ve_m_s, vehicle.vd_m_s], dtype=np.float64)
+        )
+
+    @property
+    def tilt_rad(self) -> float:
+        vehicle = self.inputs.vehicle
+        return (
+            0.0 if vehicle is None else float(np.arccos(np.cos(vehicle.roll_rad) * np.cos(vehicle.pitch_rad)))
+        )
+
+    @cached_property
+    def others(self) -> list[podwatch.fleet_row_t]:
+        """Living drones but this one, by id."""
+        rows = self.inputs.fleet.rows if self.inputs.fleet is not None else []
+        return sorted(
+            (r for r in rows if r.alive and r.id >= 1 and r.id != self.drone_id), key=lambda r: r.id
+        )
+
+    @cached_property
+    def own_row(self) -> podwatch.fleet_row_t | None:
+        rows = self.inputs.fleet.rows if self.inputs.fleet is not None else []
+        return next((row for row in rows if row.id == self.drone_id), None)
+
+    @cached_property
+    def boat(self) -> podwatch.fleet_row_t | None:
+        rows = self.inputs.fleet.rows if self.inputs.fleet is not None else []
+        return next((row for row in rows if row.id == 0 and row.alive), None)
+
+    def row_age_s(self, row: podwatch.fleet_row_t) -> float:
+        said = self.inputs.fleet.utime if self.inputs.fleet is not None else self.utime
+        return row.age_ms * 1e-3 + max(self.seconds_since(said), 0.0)
+
+    @cached_property
+    def circle(self) -> list[int]:
+        """Ids of the drones that have a place on the gathering circle, this one among them, in ring order."""
+        return sorted([self.drone_id, *(row.id for row in self.others if row.state in IN_CIRCLE)])
+
+    @property
+    def home(self) -> Array:
+        """(3,) over the home slot, at this drone's layer; round the boat where it is heard."""
+        entry = self.mission.home(self.drone_id)
+        height_m = self.layer(self.mission.limits.min_height_m + 2.0)
+        base = (0.0, 0.0) if self.boat is None else (self.boat.n_m, self.boat.e_m)
+        return np.array([base[0] + entry.home_n_m, base[1] + entry.home_e_m, -height_m])
+
+    def layer(self, lowest_m: float, most: int = 4) -> float:
+        """This drone's height in the roster's layers, `most` at most, from `lowest_m` up."""
+        roster = self.mission.roster
+        heights = layer_heights(len(roster), lowest_m, self.mission.limits.max_height_m - 1.0, most=most)
+        return float(heights[roster.index(self.drone_id)])
+
+    @property
+    def command(self) -> int:
+        """The operator's command that holds for this drone now (operator_t)."""
+        order = self.inputs.fleet.order if self.inputs.fleet is not None else None
+        if order is None or order.utime == 0 or order.target not in (0, self.drone_id):
+            return int(podwatch.operator_t.NONE)
+        return int(order.command)
+
+    def map_position(self, animal: int, max_age_s: float = 60.0) -> Array | None:
+        """(2,) of an animal in the fleet's map, None where the map does not hold it or held it too long
+        ago.
+        """
+        entry = self.map_entry(animal)
+        if entry is None or entry.age_ms * 1e-3 + self.seconds_since(self._identities_utime) > max_age_s:
+            return None
+        return np.array([entry.n_m, entry.e_m], dtype=np.float64)
+
+    def map_entry(self, animal: int) -> podwatch.map_animal_t | None:
+        identities = self.inputs.identities
+        entries = identities.map if identities is not None else []
+        return next((entry for entry in entries if entry.id == animal >= 0), None)
+
+    @property
+    def _identities_utime(self) -> int:
+        return self.inputs.identities.utime if self.inputs.identities is not None else self.utime
