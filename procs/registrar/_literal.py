@@ -1,7 +1,8 @@
-"""Box-ICP as the paper prints it (Algorithm 1), for reference: four corners a box, no re-boxing, from the identity.
+"""Box-ICP as the paper prints it (Algorithm 1), for reference: four corners a box, no re-boxing, from the
+identity.
 
-The one change is of speed, not of result: a 4x4 assignment has 24 permutations, so the inner problem of all pairs of boxes
-is one product of the (N1*N2, 16) corner distances with a (16, 24) table of ones and zeros.
+The one change is of speed, not of result: a 4x4 assignment has 24 permutations, so the inner problem of all
+pairs of boxes is one product of the (N1*N2, 16) corner distances with a (16, 24) table of ones and zeros.
 """
 
 from itertools import permutations
@@ -29,7 +30,9 @@ def corners_of(boxes: Array) -> Array:
 
 
 def corner_costs(source: Array, target: Array) -> tuple[Array, NDArray[np.intp]]:
-    """(N1, 4, 2) and (N2, 4, 2) corners -> the best total corner distance (N1, N2) and its permutation (N1, N2)."""
+    """(N1, 4, 2) and (N2, 4, 2) corners -> the best total corner distance (N1, N2) and its permutation (N1,
+    N2).
+    """
     flat_source = source.reshape(-1, 2) @ np.array([1.0, 1.0j])
     flat_target = target.reshape(-1, 2) @ np.array([1.0, 1.0j])
     distances = np.abs(flat_source[:, None] - flat_target[None, :])
@@ -40,7 +43,9 @@ def corner_costs(source: Array, target: Array) -> tuple[Array, NDArray[np.intp]]
 
 
 def literal_alignment(source: Array, target: Array) -> tuple[Array, NDArray[np.intp], Array, int]:
-    """(N1, 4) and (N2, 4) boxes -> transform (3, 3), matches (K, 2), corner cost of each match (K,) px, iterations."""
+    """(N1, 4) and (N2, 4) boxes -> transform (3, 3), matches (K, 2), corner cost of each match (K,) px,
+    iterations.
+    """
     transform = np.eye(3)
     corners, goals = corners_of(source), corners_of(target)
     previous = None

@@ -1,8 +1,10 @@
-"""What registration knows of each animal in a view or in a map: centre, shape up to a mirror, and what its absence costs.
+"""What registration knows of each animal in a view or in a map: centre, shape up to a mirror, and what its
+absence costs.
 
-An axis-aligned box of a long body tells the body's axis up to a mirror. Taking the body for an ellipse of fixed width, the
-box gives the ellipse's second-moment matrix but for the sign of its off-diagonal term; both candidates are kept, and any
-homography carries them through its Jacobian. An animal seen from two headings has one candidate left.
+An axis-aligned box of a long body tells the body's axis up to a mirror. Taking the body for an ellipse of
+fixed width, the box gives the ellipse's second-moment matrix but for the sign of its off-diagonal term;
+both candidates are kept, and any homography carries them through its Jacobian. An animal seen from two
+headings has one candidate left.
 """
 
 from dataclasses import dataclass, replace
@@ -10,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["Marks", "check_boxes", "marks_from_boxes", "rectangle"]
+__all__ = ["Marks", "check_boxes", "ellipse_shapes", "marks_from_boxes", "rectangle"]
 
 Array = NDArray[np.float64]
 
@@ -24,15 +26,17 @@ DETECTION_PRICE = (
 class Marks:
     """Animals as one view or one map knows them, in that frame's own length unit.
 
-    `centres` (N, 2); `shapes` (N, 2, 2, 2), two candidates of the matrix whose diagonal is the box's squared width and
-    height; `prices` (N,) nats, the price of a mark without a partner although it lies in the other's `window`;
-    `window` (M, 2), the convex outline of what the view covers, or None where nobody said.
+    `centres` (N, 2); `shapes` (N, 2, 2, 2), two candidates of the matrix whose diagonal is the box's
+    squared width and height; `prices` (N,) nats, the price of a mark without a partner although it lies in
+    the other's `window`; `window` (M, 2), the convex outline of what the view covers, or None where nobody
+    said; `axis_known` (N,) 0 or 1, 0 where the shapes say nothing of the axis (None: all known).
     """
 
     centres: Array
     shapes: Array
     prices: Array
     window: Array | None = None
+    axis_known: Array | None = None
 
     def __len__(self) -> int:
         return len(self.centres)
@@ -55,6 +59,18 @@ class Marks:
             corners = np.column_stack([self.window, np.ones(len(self.window))]) @ homography.T
             window = corners[:, :2] / corners[:, 2:]
         return replace(self, centres=centres, shapes=shapes, window=window)
+
+
+def ellipse_shapes(sizes: Array, axes_rad: Array) -> Array:
+    """(N,) sizes and (N, 2) candidate axes, radians from the frame's first coordinate to its second -> (N,
+    2, 2, 2) shapes.
+    """
+    long = (1 - BODY_WIDTH**2) / (1 + BODY_WIDTH**2)
+    shapes = np.empty((len(sizes), 2, 2, 2))
+    shapes[..., 0, 0] = 1 + long * np.cos(2 * axes_rad)
+    shapes[..., 1, 1] = 1 - long * np.cos(2 * axes_rad)
+    shapes[..., 0, 1] = shapes[..., 1, 0] = long * np.sin(2 * axes_rad)
+    return np.asarray(shapes * (sizes**2 / 2)[:, None, None, None])
 
 
 def rectangle(width: float, height: float) -> Array:

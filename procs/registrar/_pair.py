@@ -45,8 +45,9 @@ def apply_homographies(homographies: Array, points: Array) -> tuple[Array, Array
 class Prior:
     """What is known of the transform beforehand; every member may be None.
 
-    `rotation_rad` (mean, std) of the turn from source axes to target axes; `log_scale` (mean, std) of ln(target length per
-    source length); `position` (mean (2,), std) in target units of where the source's `anchor` (2,) comes to lie.
+    `rotation_rad` (mean, std) of the turn from source axes to target axes; `log_scale` (mean, std) of
+    ln(target length per source length); `position` (mean (2,), std) in target units of where the source's
+    `anchor` (2,) comes to lie.
     """
 
     rotation_rad: tuple[float, float] | None = None
@@ -78,6 +79,8 @@ class Pair:
         self.source_window, self.target_window = _window(self.source), _window(self.target)
         # The smaller of the two covers: where an unmatched box might be in either view.
         self.area = max(min(_polygon_area(self.source_window), _polygon_area(self.target_window)), 4.0)
+        known = [np.ones(len(m)) if m.axis_known is None else m.axis_known for m in (source, target)]
+        self.axis_weight = known[0][:, None] * known[1][None, :]
         self.axis_table = self._axis_table()
 
     def _normalised(self, prior: Prior) -> Prior:
@@ -103,14 +106,17 @@ class Pair:
         return self.axis_ratio(self.source_axes[None] * half_turns[:, None, None])
 
     def axis_ratio(self, axes: NDArray[np.complex128]) -> Array:
-        """(K, N1, 2) rotated source axes -> (K, N1, N2) log-likelihood ratio of same body against any body."""
+        """(K, N1, 2) rotated source axes -> (K, N1, N2) log-likelihood ratio of same body against any
+        body.
+        """
         best = np.full((len(axes), len(self.source), len(self.target)), np.inf)
         for a in range(2):
             for b in range(2):
                 apart = axes[:, :, None, a] - self.target_axes[None, None, :, b]
                 np.minimum(best, apart.real**2 + apart.imag**2, out=best)
         peak = (1 - AXIS_OUTLIER) * 1.25 / AXIS_SIGMA
-        return np.asarray(np.log(peak * np.exp(-best / (2 * AXIS_SIGMA**2)) + AXIS_OUTLIER))
+        ratio = np.log(peak * np.exp(-best / (2 * AXIS_SIGMA**2)) + AXIS_OUTLIER)
+        return np.asarray(ratio * self.axis_weight)
 
     def size_ratio(self, log_sizes: Array) -> Array:
         """(K, N1) ln sizes of the mapped source -> (K, N1, N2) log-likelihood ratio."""
@@ -154,7 +160,9 @@ class Pair:
         return total
 
     def insideness(self, homographies: Array, mapped: Array) -> tuple[Array, Array]:
-        """How surely each source mark lies in the target's window (K, N1), and each target in the source's (K, N2)."""
+        """How surely each source mark lies in the target's window (K, N1), and each target in the source's
+        (K, N2).
+        """
         inverse = np.linalg.inv(homographies)
         back, _ = apply_homographies(inverse, self.target.centres)
         return _inside(mapped, self.target_window), _inside(back, self.source_window)

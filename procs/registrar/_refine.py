@@ -1,4 +1,6 @@
-"""From similarities to homographies and matchings: assignment with a dustbin, then a ridge fit, from wide to narrow."""
+"""From similarities to homographies and matchings: assignment with a dustbin, then a ridge fit, from wide
+to narrow.
+"""
 
 from dataclasses import dataclass
 
@@ -13,7 +15,8 @@ __all__ = ["Candidate", "refine"]
 Array = NDArray[np.float64]
 Ints = NDArray[np.intp]
 
-# Body sizes. An animal's own motion between two frames and the box's jitter both count; the widest is a pod that moved.
+# Body sizes. An animal's own motion between two frames and the box's jitter both count; the widest is a pod
+# that moved.
 SIGMAS = (0.8, 0.4, 0.2, 0.1, 0.06)
 SIGMA_PRICES = (4.0, 2.0, 1.0, 0.0, 0.0)  # nats: most views of one instant agree within a tenth of a body
 FITS_PER_SIGMA = 2
@@ -24,8 +27,8 @@ SCALE_SLACK_STD = 0.5  # keeps scale and turn where too few matches fix them
 
 @dataclass(frozen=True)
 class Candidate:
-    """One matching: `columns` (N1,) target of each source or -1, its log evidence, its homography in body units,
-    the log-likelihood gain (N1, N2) of every match under it, and the sigma that explains it best."""
+    """One matching: `columns` (N1,) target of each source or -1, its log evidence, its homography in body
+    units, the log-likelihood gain (N1, N2) of every match under it, and the sigma that explains it best."""
 
     columns: Ints
     score: float
@@ -61,7 +64,9 @@ def _assign(gains: Array) -> Ints:
 def _normal_equations(
     pair: Pair, homographies: Array, columns: Ints, sigma: Array
 ) -> tuple[Array, Array, Array]:
-    """The ridge fit's matrix (K, 8, 8), right side (K, 8) and the ridge of its four deviations from similarity (K,)."""
+    """The ridge fit's matrix (K, 8, 8), right side (K, 8) and the ridge of its four deviations from
+    similarity (K,).
+    """
     x = pair.source.centres
     matched = columns >= 0
     goal = pair.target.centres[columns]

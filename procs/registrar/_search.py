@@ -27,7 +27,9 @@ def _angle_bins(alpha: Complex) -> NDArray[np.intp]:
 
 
 def _from_pairs(pair: Pair) -> tuple[Complex, Complex, Array]:
-    """Similarities that carry two source marks onto two target marks: (H,) scale and turn, (H,) shift, (H,) own score."""
+    """Similarities that carry two source marks onto two target marks: (H,) scale and turn, (H,) shift, (H,)
+    own score.
+    """
     zs, zt = _complex(pair.source.centres), _complex(pair.target.centres)
     i, j = np.triu_indices(len(zs), 1)
     k, m = np.nonzero(~np.eye(len(zt), dtype=bool))
@@ -51,7 +53,9 @@ def _from_pairs(pair: Pair) -> tuple[Complex, Complex, Array]:
 
 
 def _from_whole_sets(pair: Pair) -> tuple[Complex, Complex]:
-    """Turns of the centred and scaled sets, for views that hold the same animals however far each has moved."""
+    """Turns of the centred and scaled sets, for views that hold the same animals however far each has
+    moved.
+    """
     zs, zt = _complex(pair.source.centres), _complex(pair.target.centres)
     spread_source, spread_target = np.std(zs), np.std(zt)
     scale = spread_target / spread_source if min(spread_source, spread_target) > 1e-6 else 1.0
@@ -60,7 +64,9 @@ def _from_whole_sets(pair: Pair) -> tuple[Complex, Complex]:
 
 
 def _from_single_marks(pair: Pair) -> tuple[Complex, Complex]:
-    """Each source mark laid on each target mark; the turn from the prior or from a coarse fan, the scale from sizes."""
+    """Each source mark laid on each target mark; the turn from the prior or from a coarse fan, the scale
+    from sizes.
+    """
     zs, zt = _complex(pair.source.centres), _complex(pair.target.centres)
     if pair.prior.rotation_rad is not None:
         mean, std = pair.prior.rotation_rad
@@ -122,7 +128,9 @@ def find_similarities(pair: Pair) -> Array:
 
 
 def _distinct(pair: Pair, alpha: Complex, beta: Complex) -> tuple[Complex, Complex]:
-    """The first MAX_KEPT similarities that are no near copy of one before: under half a body apart at the spread's edge."""
+    """The first MAX_KEPT similarities that are no near copy of one before: under half a body apart at the
+    spread's edge.
+    """
     spread = max(float(np.abs(_complex(pair.source.centres)).max()), 1.0)
     kept: list[int] = []
     for index in range(len(alpha)):

@@ -1,8 +1,9 @@
 """Box-ICP: which box of one view is which box of another (paper, Algorithm 1; DESIGN section 7).
 
-`mode="literal"` is the algorithm as printed. `mode="robust"`, the default, holds at any relative heading, with misses,
-false alarms, tilt and partly overlapping views: hypotheses from pairs of boxes, one coarse score for all of them,
-refinement from wide to narrow with a dustbin, and a confidence from the margin over every other matching that was met.
+`mode="literal"` is the algorithm as printed. `mode="robust"`, the default, holds at any relative heading,
+with misses, false alarms, tilt and partly overlapping views: hypotheses from pairs of boxes, one coarse
+score for all of them, refinement from wide to narrow with a dustbin, and a confidence from the margin over
+every other matching that was met.
 """
 
 from collections.abc import Sequence
@@ -33,9 +34,10 @@ class BoxAlignment:
     """How the source view's boxes lie in the target view.
 
     `transform` (3, 3) source px to target px; `matches` (K, 2) int rows of (source, target), by source;
-    `unmatched_source`, `unmatched_target` int rows without a partner; `residual_px` the root mean square distance of the
-    matched centres in target px, 0 where none; `confidence` 0-1, the chance that every match is right;
-    `is_ambiguous` True where another matching explains the boxes nearly as well; `iterations` rounds of assignment and fit.
+    `unmatched_source`, `unmatched_target` int rows without a partner; `residual_px` the root mean square
+    distance of the matched centres in target px, 0 where none; `confidence` 0-1, the chance that every
+    match is right; `is_ambiguous` True where another matching explains the boxes nearly as well;
+    `iterations` rounds of assignment and fit.
     """
 
     transform: Array
@@ -58,10 +60,11 @@ def box_icp(
 ) -> BoxAlignment:
     """Match the boxes of two views of one scene.
 
-    source, target: (N1, 4), (N2, 4) left, top, right, bottom in px (u right, v down). image_size: (width, height) px of both
-    views; with it an unmatched box counts against a matching only where the other camera should have seen it.
-    heading_prior_rad: compass heading of the target's camera minus that of the source's, clockwise positive, or that with
-    its standard deviation (default 8 degrees); robust mode only. Either view may be empty: no match, confidence 0.
+    source, target: (N1, 4), (N2, 4) left, top, right, bottom in px (u right, v down). image_size: (width,
+    height) px of both views; with it an unmatched box counts against a matching only where the other camera
+    should have seen it. heading_prior_rad: compass heading of the target's camera minus that of the
+    source's, clockwise positive, or that with its standard deviation (default 8 degrees); robust mode only.
+    Either view may be empty: no match, confidence 0.
 
     Raises ValueError for a NaN or reversed box (naming the row), a bad image size, prior or mode.
     """
@@ -97,7 +100,9 @@ def _heading_prior(heading_prior_rad: float | Sequence[float] | None) -> Prior:
 
 
 def align_marks(source: Marks, target: Marks, *, prior: Prior | None = None) -> BoxAlignment:
-    """Robust Box-ICP on marks in any length unit: a view in metres against a map, or a view against a view."""
+    """Robust Box-ICP on marks in any length unit: a view in metres against a map, or a view against a
+    view.
+    """
     prior = prior or Prior()
     if not len(source) or not len(target):
         return _unmatched(len(source), len(target))
@@ -176,7 +181,9 @@ def _transposed(alignment: BoxAlignment, source: Marks, target: Marks) -> BoxAli
 
 
 def _judge(candidates: list[Candidate]) -> tuple[float, bool]:
-    """Confidence and ambiguity of the best matching from its margins over all that could stand in its place."""
+    """Confidence and ambiguity of the best matching from its margins over all that could stand in its
+    place.
+    """
     best = candidates[0]
     margins = [best.score - other.score for other in candidates[1:]]
     contradicting = [
@@ -197,7 +204,9 @@ def _contradicts(one: Ints, other: Ints) -> bool:
 
 
 def _exchange_margins(best: Candidate) -> tuple[Array, Array]:
-    """Loss from exchanging two partners (P,), and from adding, dropping or moving one match (L,), under the best fit."""
+    """Loss from exchanging two partners (P,), and from adding, dropping or moving one match (L,), under the
+    best fit.
+    """
     rows = np.flatnonzero(best.columns >= 0)
     columns = best.columns[rows]
     own = best.gains[rows, columns]
@@ -218,7 +227,9 @@ def _exchange_margins(best: Candidate) -> tuple[Array, Array]:
 
 
 def _literal(source: Array, target: Array) -> BoxAlignment:
-    """Confidence is 1 less the mean corner distance in mean box sides: the paper gives none, and no ambiguity either."""
+    """Confidence is 1 less the mean corner distance in mean box sides: the paper gives none, and no
+    ambiguity either.
+    """
     if not len(source) or not len(target):
         return _unmatched(len(source), len(target))
     transform, matches, costs, iterations = literal_alignment(source, target)
