@@ -54,7 +54,7 @@ CHANNELS = (
     Channel(TRACK, podwatch.track_t, rate_hz=20, max_age_s=0.5),
     Channel(SETPOINT, podwatch.setpoint_t, rate_hz=10, max_age_s=0.5),
     Channel(VEHICLE_STATE, podwatch.vehicle_state_t, rate_hz=20, max_age_s=1),
-    Channel(MISSION_STATE, podwatch.mission_state_t, rate_hz=5, max_age_s=2),
+    Channel(MISSION_STATE, podwatch.mission_state_t, rate_hz=10, max_age_s=2),
     Channel(FLEET_STATE, podwatch.fleet_state_t, rate_hz=4, max_age_s=2),
     Channel(LINK_STATE, podwatch.link_state_t, rate_hz=1, max_age_s=3),
     Channel(LOG_STATE, podwatch.log_state_t, rate_hz=1, max_age_s=3),

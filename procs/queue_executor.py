@@ -66,6 +66,7 @@ class VirtualBus:
         self.queue = queue
         self._hearers: dict[str, list[tuple[QueueRuntime, Subscription]]] = {}
         self._hear_all: list[QueueRuntime] = []
+        self.observers: list[Callable[[str, bytes], None]] = []  # who only looks on, outside the drone
 
     def listen(self, runtime: "QueueRuntime", subscription: Subscription) -> None:
         self._hearers.setdefault(subscription.channel, []).append((runtime, subscription))
@@ -85,6 +86,8 @@ class VirtualBus:
             runtime.message_arrived(subscription, data)
         for runtime in self._hear_all:
             runtime.raw_arrived(channel, data)
+        for observe in self.observers:
+            observe(channel, data)
 
 
 class QueueRuntime(Runtime):

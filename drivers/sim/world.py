@@ -8,13 +8,14 @@ import numpy as np
 
 from drivers.sim.autopilot import SimAutopilot
 from drivers.sim.pod import Pod, PodSettings
-from drivers.sim.vehicle import Vehicle
+from drivers.sim.vehicle import Vehicle, Wind
 from lcmtypes import make
 from lcmtypes.podwatch import world_animal_t, world_drone_t, world_state_t
 
 __all__ = ["AutopilotLink", "World", "WorldSettings"]
 
 STEP_US = 20_000
+GUST_SHARE = 0.2  # standard deviation of gusts, of the mean wind
 
 
 class AutopilotLink(Protocol):
@@ -49,22 +50,21 @@ class World:
         self.vehicles: dict[int, Vehicle] = {}
         self.autopilots: dict[int, SimAutopilot] = {}
         self.dead: dict[int, float] = {}
-        wind = np.random.default_rng([settings.seed, 2])
-        towards_rad = float(wind.uniform(-np.pi, np.pi))
-        wind_ned = (settings.wind_m_s * np.cos(towards_rad), settings.wind_m_s * np.sin(towards_rad), 0.0)
-        for drone_id, (n_m, e_m) in settings.homes.items():
+        towards_rad = float(np.random.default_rng([settings.seed, 2]).uniform(-np.pi, np.pi))
+        mean = (settings.wind_m_s * float(np.cos(towards_rad)), settings.wind_m_s * float(np.sin(towards_rad)))
+        for drone_id, home in settings.homes.items():
             random = np.random.default_rng([settings.seed, 3, drone_id])
             self.vehicles[drone_id] = Vehicle(
-                home_ned_m=(n_m, e_m, 0.0),
-                random=random,
-                wind_ned_m_s=wind_ned,
+                home,
+                random,
+                wind=Wind(mean_ne_m_s=mean, gust_m_s=GUST_SHARE * settings.wind_m_s),
                 yaw_rad=float(random.uniform(-np.pi, np.pi)),
             )
             self.autopilots[drone_id] = SimAutopilot(
                 self.vehicles[drone_id],
-                system_id=drone_id,
-                random=random,
-                origin_deg_m=settings.origin,
+                drone_id,
+                random,
+                origin=settings.origin,
                 gps_noise_m=settings.gps_noise_m,
                 compass_error_deg=settings.compass_error_deg,
             )
@@ -93,7 +93,7 @@ class World:
         """The truth now."""
         drones = []
         for drone_id, vehicle in self.vehicles.items():
-            pose, velocity = vehicle.pose, vehicle.velocity_ned_m_s
+            pose, velocity = vehicle.pose, vehicle.velocity_ned
             drones.append(
                 make(
                     world_drone_t,
