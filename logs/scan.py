@@ -114,7 +114,7 @@ class Scan:
     def _records(self, offset: int, size: int) -> Iterator[_Record]:
         """Records of the data section that matter, from `offset`; behind damage, from the next chunk.
 
-        A record but a chunk has no checksum, so a damaged length is found out late, at a place where no record
+        A record but a chunk has no checksum, so a damaged length is found out late, where no record
         begins: everything behind the newest chunk is then searched again.
         """
         searched_to = offset

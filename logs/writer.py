@@ -1,10 +1,9 @@
 """Writes a drone's bus to an MCAP file: raw LCM bytes, and all that a reader needs to decode them."""
 
-import contextlib
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import IO, Any, cast
 
 from mcap.writer import CompressionType, Writer
 
@@ -33,6 +32,38 @@ def fresh_path(path: Path) -> Path:
     return candidate
 
 
+class _AppendedFile:
+    """The file as MCAP's writer sees it: what is written waits in memory until `flush` appends it.
+
+    No handle stays open in between, so a logger may end at any time and leaves nothing but whole chunks.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._waiting = bytearray()
+        self._n_flushed = 0
+        with path.open("xb"):
+            pass
+
+    def write(self, data: bytes) -> int:
+        self._waiting += data
+        return len(data)
+
+    def tell(self) -> int:
+        return self._n_flushed + len(self._waiting)
+
+    def flush(self) -> None:
+        with open(self._path, "ab", opener=_open_existing) as file:
+            file.write(self._waiting)
+        self._n_flushed += len(self._waiting)
+        self._waiting.clear()
+
+
+def _open_existing(path: str, flags: int) -> int:
+    """A log that was taken away is not made anew without its head: that is an error for people to see."""
+    return os.open(path, flags & ~os.O_CREAT)
+
+
 class LogWriter:
     """An MCAP file that is readable up to its last second at any time.
 
@@ -53,7 +84,7 @@ class LogWriter:
         self._channel_ids: dict[tuple[str, bool], int] = {}
         self._schema_ids: dict[str, int] = {}
         try:
-            self._file = self.path.open("xb")
+            self._file = _AppendedFile(self.path.absolute())
         except FileExistsError:
             raise LogError(
                 f"{path}: exists already and is not overwritten; give a path that is free"
@@ -62,7 +93,9 @@ class LogWriter:
             raise LogError(
                 f"{path}: cannot be made ({error.strerror}); give a path in a folder that may be written"
             ) from error
-        self._mcap: Any = Writer(self._file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
+        self._mcap: Any = Writer(
+            cast("IO[bytes]", self._file), chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD
+        )
         self._mcap.start(profile="", library=LIBRARY)
         self._mcap.add_metadata(METADATA, {"drone_id": str(drone_id), **(metadata or {})})
         self._file.flush()
@@ -102,18 +135,9 @@ class LogWriter:
         self._chunk_start_us = None
 
     def close(self) -> None:
-        """Write the summary and close the file; a second call does nothing."""
-        if self._file.closed:
-            return
-        try:
-            self._mcap.finish()
-        finally:
-            self._file.close()
-
-    def abandon(self) -> None:
-        """Close the file without a summary, after a write that failed: whole chunks still read."""
-        with contextlib.suppress(OSError):
-            self._file.close()
+        """Write the summary; nothing can be written afterwards."""
+        self._mcap.finish()
+        self._file.flush()
 
     def _channel_id(self, channel: str, *, is_known: bool) -> int:
         """The MCAP channel of a bus channel; bytes of another type on it go to a channel without a schema."""

@@ -98,9 +98,7 @@ class Logger:
 
     def _fail(self, error: OSError) -> None:
         """A write failed: what was flushed stays readable, nothing more is written."""
-        if self._writer is not None:
-            self._writer.abandon()
-            self._writer = None
+        self._writer = None
         self._problem = (
             f"{self._path}: writing failed ({error.strerror}); logging has stopped, restart the logger"
         )

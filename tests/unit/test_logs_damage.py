@@ -56,10 +56,8 @@ def closed_log(tmp_path_factory) -> bytes:
 def killed_log(tmp_path_factory) -> bytes:
     """What is on the disk of a logger that was killed in its fifth second: four chunks."""
     path = tmp_path_factory.mktemp("logs") / "killed.mcap"
-    writer = write(path, 95, close=False)
-    content = path.read_bytes()
-    writer.abandon()
-    return content
+    write(path, 95, close=False)
+    return path.read_bytes()
 
 
 def chunk_offsets(log: bytes) -> list[int]:
@@ -72,12 +70,19 @@ def chunk_offsets(log: bytes) -> list[int]:
 
 @pytest.mark.parametrize("n_messages", [1, 20, 21, 39, 40, 95])
 def test_at_any_time_all_but_the_last_second_is_on_the_disk(tmp_path, n_messages):
-    writer = write(tmp_path / "a.mcap", n_messages, close=False)
+    write(tmp_path / "a.mcap", n_messages, close=False)
     seqs, [warning] = read_with_warnings(tmp_path / "a.mcap")
     assert seqs == list(range(len(seqs)))
     assert n_messages - len(seqs) <= 20
     assert "was not closed" in warning
-    writer.abandon()
+
+
+def test_a_log_that_was_taken_away_is_not_made_anew(tmp_path):
+    writer = write(tmp_path / "a.mcap", 1, close=False)
+    (tmp_path / "a.mcap").unlink()
+    with pytest.raises(FileNotFoundError):
+        writer.flush()
+    assert not (tmp_path / "a.mcap").exists()
 
 
 def test_a_quiet_bus_is_flushed_too(tmp_path):
@@ -86,7 +91,6 @@ def test_a_quiet_bus_is_flushed_too(tmp_path):
     assert read_with_warnings(tmp_path / "a.mcap")[0] == []
     writer.flush_due(1_000_000)
     assert read_with_warnings(tmp_path / "a.mcap")[0] == [0]
-    writer.abandon()
 
 
 KILLED_WRITER = """
