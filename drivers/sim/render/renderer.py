@@ -267,7 +267,9 @@ def _blend(
     front = cv2.convertScaleAbs(cv2.cvtColor(piece, cv2.COLOR_BGRA2BGR), alpha=opacity * (1 - tint_share))
     if tint_bgr is not None:
         blue, green, red = (float(value) for value in tint_bgr)
-        cv2.add(front, cv2.multiply(share, (blue, green, red, 0.0), scale=opacity * tint_share / 255), dst=front)
+        cv2.add(
+            front, cv2.multiply(share, (blue, green, red, 0.0), scale=opacity * tint_share / 255), dst=front
+        )
     region = image[top:bottom, left:right]
     behind = cv2.convertScaleAbs(share, alpha=-opacity, beta=255.0)
     cv2.add(cv2.multiply(region, behind, scale=1 / 255), front, dst=region)

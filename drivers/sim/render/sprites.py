@@ -174,7 +174,8 @@ def make_poster(species: Species, rng: np.random.Generator) -> Sprite:
     station, side = _body_grid()
     sheet = (np.abs(station - 0.5) < 0.58) & (np.abs(side) < 0.28)
     print_area = (np.abs(station - 0.5) < 0.565) & (np.abs(side) < 0.265)
-    printed = np.array([rng.uniform(110, 170), rng.uniform(70, 120), rng.uniform(15, 70)], np.float32)
+    blues = np.array([rng.uniform(110, 170), rng.uniform(70, 120), rng.uniform(15, 70)], np.float32)
+    printed = blues if rng.random() < 0.7 else np.full(3, 205, np.float32)  # some sheets are left white
     picture = np.where(print_area[..., None], printed + 5 * _noise(rng, 30, 20)[..., None], np.float32(225))
     picture = picture * (1 - animal[..., 3:] / 255) + animal[..., :3]
     crease = 1 + 0.05 * _noise(rng, 90, 60)

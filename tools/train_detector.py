@@ -1,0 +1,295 @@
+"""Trains the whale detector on rendered scenes and photographs, exports it to ONNX, and measures it.
+
+    podwatch train detector --out runs/detector            trains (goes on where a killed run stopped) and exports
+    podwatch train detector --smoke                        a few steps, an export and its check, under two minutes
+    podwatch train detector --data my/data.yaml            adds pictures of your own in the YOLO layout
+
+Needs the `train` extra (torch, onnx). Every sample depends on (seed, step) alone, so a resumed run sees what an
+uninterrupted one would have seen.
+"""
+
+import os
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from tools.detector_data import (
+    Sample,
+    augment,
+    cached_scenes,
+    letterboxed,
+    numbered,
+    photograph_sample,
+    read_yolo,
+    scene_sample,
+)
+from tools.detector_export import check_export, export
+from tools.detector_loss import detection_loss
+from tools.detector_model import WhaleDetector, cell_centres, decode
+
+__all__ = ["Settings", "command", "held_out", "real_data", "train"]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What shapes a training, each with its reason."""
+
+    seed: int = 0
+    steps: int = 6500  # about 80 minutes on one thread of a slow core; more steps still help
+    batch: int = 16  # the smallest whose normalisation statistics are steady; larger ones cost steps
+    rate: float = 2e-3  # the highest that never diverged with AdamW on this network
+    last_rate_share: float = 0.02  # a cosine down to this settles the boxes
+    warmup_steps: int = 200  # assignment is random before the boxes mean anything
+    weight_decay: float = 0.03  # the photographs are few
+    average_decay: float = 0.998  # the exported weights are a running mean over about 500 steps
+    early_side: int = 256  # smaller pictures first: half again as many steps for the time
+    side: int = 320  # what the exported network takes
+    early_share: float = 0.55  # of the steps, at the early side
+    photograph_share: float = 0.5  # of the samples; the rest are rendered
+    letterbox_share: float = 0.35  # cameras are wide, the network's input is square
+    scenes: int = 3000  # rendered once: more of them cost disk and time, crops vary them
+    scenes_seed: int = 0
+    save_every_steps: int = 100  # a kill loses a minute
+
+
+def real_data() -> Path:
+    """The folder of real pictures: PODWATCH_REAL_DATA, or ../shared/data beside the project; it may be missing."""
+    beside = Path(__file__).resolve().parents[2] / "shared" / "data"
+    return Path(os.environ.get("PODWATCH_REAL_DATA", str(beside)))
+
+
+def held_out(images: Sequence[Path]) -> tuple[list[Path], list[Path]]:
+    """(for training, held out): every fifth in the order of the numbers in their names, from the first, is held out."""
+    ordered = sorted(images, key=numbered)
+    return [path for i, path in enumerate(ordered) if i % 5], ordered[::5]
+
+
+def _photographs(data: Path | None) -> list[Sample]:
+    """All photographs to learn from: four fifths of the right whales, the minke, and the user's own."""
+    root, photos = real_data(), []
+    folder = root / "right_whales"
+    if folder.is_dir():
+        chosen, _ = held_out(sorted((folder / "images").glob("*.jpg")))
+        photos += read_yolo(chosen, folder / "labels")
+    minke = root / "minke_photogrammetry" / "minke.jpg"
+    if minke.is_file():
+        image = cv2.imread(str(minke), cv2.IMREAD_COLOR)
+        if image is not None:
+            # Measured by eye in the picture, 2978 x 1985: snout to flukes; the caption is cut off.
+            small = cv2.resize(image[:1900], None, fx=0.4, fy=0.4, interpolation=cv2.INTER_AREA)
+            box = np.array([[205, 640, 2700, 1360, 0]], np.float32) * np.float32(0.4) + np.float32(
+                [0, 0, 0, 0, 1]
+            )
+            photos.append(Sample(np.asarray(small, np.uint8), box))
+    if data is not None:
+        photos += _own_pictures(data)
+    return photos
+
+
+def _own_pictures(data_yaml: Path) -> list[Sample]:
+    """The `train` pictures of a YOLO data.yaml whose labels lie in labels/ beside images/."""
+    if not data_yaml.is_file():
+        raise ValueError(f"{data_yaml}: no such file; give the data.yaml of a YOLO data set")
+    entries = dict(
+        (part.strip() for part in line.split(":", 1))
+        for line in data_yaml.read_text().splitlines()
+        if ":" in line and not line.startswith((" ", "#"))
+    )
+    if "train" not in entries:
+        raise ValueError(
+            f"{data_yaml}: has no entry 'train'; it must name the folder of the training pictures"
+        )
+    images = (data_yaml.parent / entries.get("path", ".") / entries["train"]).resolve()
+    found = sorted(
+        path for path in images.glob("*") if path.suffix.lower() in (".jpg", ".jpeg", ".png", ".bmp")
+    )
+    if not found:
+        raise ValueError(f"{data_yaml}: no JPEG, PNG or BMP pictures in {images}")
+    parts = list(images.parts)
+    where = max((i for i, part in enumerate(parts) if part == "images"), default=-1)
+    labels = Path(*parts[:where], "labels", *parts[where + 1 :]) if where >= 0 else images
+    return read_yolo(found, labels)
+
+
+def _batch(
+    settings: Settings,
+    step: int,
+    side: int,
+    rendered: Sequence[Sample],
+    photos: Sequence[Sample],
+    empty: Sequence[Sample],
+) -> tuple[torch.Tensor, list[torch.Tensor]]:
+    """Images (B, 3, side, side) RGB in 0-1 and a tensor (N, 5) of boxes an image, for one step."""
+    rng = np.random.default_rng([settings.seed, step])
+    images = np.empty((settings.batch, side, side, 3), np.uint8)
+    boxes = []
+    for index in range(settings.batch):
+        if photos and rng.random() < settings.photograph_share:
+            sample = photograph_sample(photos, empty, rng, side)
+        else:
+            sample = scene_sample(rendered[int(rng.integers(len(rendered)))], rng, side)
+        sample = Sample(augment(sample.image, rng), sample.boxes)
+        if rng.random() < settings.letterbox_share:
+            sample = letterboxed(sample, rng)
+        images[index] = sample.image
+        boxes.append(torch.from_numpy(sample.boxes.astype(np.float32)))
+    rgb = torch.from_numpy(np.ascontiguousarray(images[..., ::-1])).permute(0, 3, 1, 2)  # (B, 3, side, side)
+    return rgb.float().div(255).contiguous(memory_format=torch.channels_last), boxes
+
+
+def _rate(settings: Settings, step: int) -> float:
+    if step < settings.warmup_steps:
+        return settings.rate * (step + 1) / settings.warmup_steps
+    progress = (step - settings.warmup_steps) / max(settings.steps - settings.warmup_steps, 1)
+    low = settings.last_rate_share
+    return settings.rate * (low + (1 - low) * 0.5 * (1 + float(np.cos(np.pi * progress))))
+
+
+@dataclass
+class _Run:
+    """All that a checkpoint holds."""
+
+    network: WhaleDetector
+    average: dict[str, torch.Tensor]
+    optimiser: torch.optim.AdamW
+    step: int = 0
+    seconds: float = 0.0
+
+    def save(self, path: Path, settings: Settings) -> None:
+        state = {
+            "network": self.network.state_dict(),
+            "average": self.average,
+            "optimiser": self.optimiser.state_dict(),
+            "step": self.step,
+            "seconds": self.seconds,
+            "settings": asdict(settings),
+        }
+        part = path.with_suffix(".part")
+        torch.save(state, part)
+        part.replace(path)  # whole or not at all: a kill while writing keeps the last one
+
+    def load(self, path: Path) -> None:
+        state = torch.load(path, weights_only=True)
+        self.network.load_state_dict(state["network"])
+        self.optimiser.load_state_dict(state["optimiser"])
+        self.average, self.step, self.seconds = state["average"], state["step"], state["seconds"]
+
+    def follow(self, decay: float) -> None:
+        """Move the running mean of the weights a step towards them; faster while they are young."""
+        decay = min(decay, (1 + self.step) / (10 + self.step))
+        with torch.no_grad():
+            for name, value in self.network.state_dict().items():
+                if value.dtype.is_floating_point:
+                    self.average[name].lerp_(value, 1 - decay)
+                else:
+                    self.average[name].copy_(value)
+
+
+def _start(settings: Settings) -> _Run:
+    torch.manual_seed(settings.seed)
+    network = WhaleDetector().to(memory_format=torch.channels_last)
+    decayed = [p for p in network.parameters() if p.ndim > 1]
+    rest = [p for p in network.parameters() if p.ndim <= 1]  # norms and biases are not pulled to zero
+    groups = [
+        {"params": decayed, "weight_decay": settings.weight_decay},
+        {"params": rest, "weight_decay": 0.0},
+    ]
+    average = {name: value.clone() for name, value in network.state_dict().items()}
+    return _Run(network, average, torch.optim.AdamW(groups, lr=settings.rate))
+
+
+def averaged(run_folder: Path) -> WhaleDetector:
+    """The running mean of the weights of the newest checkpoint, ready to export."""
+    network = WhaleDetector()
+    network.load_state_dict(torch.load(run_folder / "checkpoint.pt", weights_only=True)["average"])
+    return network.eval()
+
+
+def train(out: Path, settings: Settings, data: Path | None = None, stop_after: int | None = None) -> Path:
+    """Train into the folder `out`, from its checkpoint if there is one, and export; returns the ONNX file's path.
+
+    `stop_after` ends the run at that step, as a kill would; the next call goes on from the last checkpoint.
+    """
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+    out.mkdir(parents=True, exist_ok=True)
+    outlines = real_data() / "whale_outlines" / "outlines.csv"
+    cache = out.parent / "detector_cache"
+    rendered = cached_scenes(cache, settings.scenes, settings.scenes_seed, "train", outlines)
+    empty = [sample for sample in rendered if len(sample.boxes) == 0]
+    photos = _photographs(data)
+    print(f"{len(rendered)} rendered scenes ({len(empty)} empty), {len(photos)} photographs", flush=True)
+    run, checkpoint, log = _start(settings), out / "checkpoint.pt", out / "log.csv"
+    if checkpoint.is_file():
+        run.load(checkpoint)
+        print(f"goes on at step {run.step} of {settings.steps}", flush=True)
+    grids = {side: cell_centres(side, side) for side in (settings.early_side, settings.side)}
+    run.network.train()
+    sums, begun = np.zeros(2), time.monotonic() - run.seconds
+    for step in range(run.step, min(settings.steps, stop_after or settings.steps)):
+        side = settings.early_side if step < settings.early_share * settings.steps else settings.side
+        images, boxes = _batch(settings, step, side, rendered, photos, empty)
+        sums += _step(run, settings, step, images, boxes, grids[side])
+        run.step, run.seconds = step + 1, time.monotonic() - begun
+        if run.step % 50 == 0:
+            line = f"{run.step},{sums[0] / 50:.4f},{sums[1] / 50:.4f},{_rate(settings, step):.6f},{run.seconds:.0f}"
+            print(f"step,score_loss,box_loss,rate,seconds {line}", flush=True)
+            with log.open("a") as file:
+                file.write(line + "\n")
+            sums[:] = 0
+        if run.step % settings.save_every_steps == 0 or run.step == settings.steps:
+            run.save(checkpoint, settings)
+    run.save(checkpoint, settings)
+    return export(averaged(out), out / "detector.onnx", settings.side)
+
+
+def _step(
+    run: _Run,
+    settings: Settings,
+    step: int,
+    images: torch.Tensor,
+    boxes: list[torch.Tensor],
+    grid: tuple[torch.Tensor, torch.Tensor],
+) -> NDArray[np.float64]:
+    """One step of the optimiser; returns (score loss, box loss)."""
+    for group in run.optimiser.param_groups:
+        group["lr"] = _rate(settings, step)
+    logits, distances = run.network(images)  # (B, 1, A), (B, 4, A)
+    score_loss, box_loss = detection_loss(logits, decode(distances, *grid), *grid, boxes)
+    loss = score_loss + box_loss
+    if not torch.isfinite(loss):
+        raise FloatingPointError(
+            f"the loss is {loss.item()} at step {step}: lower Settings.rate ({settings.rate})"
+        )
+    run.optimiser.zero_grad(set_to_none=True)
+    loss.backward()  # type: ignore[no-untyped-call]
+    torch.nn.utils.clip_grad_norm_(run.network.parameters(), 10.0)
+    run.optimiser.step()
+    run.follow(settings.average_decay)
+    return np.array([score_loss.item(), box_loss.item()])
+
+
+def command(
+    out: Path = Path("runs/detector"),
+    data: Path | None = None,
+    steps: int = Settings.steps,
+    seed: int = 0,
+    smoke: bool = False,
+) -> None:
+    """Train the detector into OUT and export OUT/detector.onnx; --smoke does a few steps and checks the export."""
+    settings = Settings(seed=seed, steps=steps)
+    if smoke:
+        settings = Settings(
+            seed=seed, steps=6, batch=4, scenes=12, early_side=128, warmup_steps=2, save_every_steps=3
+        )
+    begun = time.monotonic()
+    model = train(out, settings, data)
+    print(
+        f"{model}: {check_export(averaged(out), model, settings.side)}; {time.monotonic() - begun:.0f} s in all"
+    )
