@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 
 from procs.tracker._appearance import Appearance
 from procs.tracker._body import Body, body_of_box, body_of_weights
+from procs.tracker._pod import settle
 from procs.tracker._sight import Map, Sight, body_patch, segment
 from procs.tracker._window import Window, window_round
 
-__all__ = ["WORKING_LENGTH_PX", "FirstLook", "first_look"]
+__all__ = ["WORKING_LENGTH_PX", "Companion", "FirstLook", "first_look"]
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -25,17 +26,30 @@ BOX_EDGE = 1.12  # boxes are loose, seldom tight: this far beyond its edge no pi
 
 
 @dataclass(frozen=True)
+class Companion:
+    """Another animal in view, frame px: a guess of its ellipse, and its box (4,) where the detector gave
+    one.
+    """
+
+    body: Body
+    box: Array | None
+
+
+@dataclass(frozen=True)
 class FirstLook:
-    """What the first look found; `body` is in frame px, `sight` in the window's."""
+    """What the first look found; `body` and `companions` are in frame px, `sight` in the window's."""
 
     appearance: Appearance
     window: Window
     sight: Sight
     body: Body
+    companions: list[Body]
     template: Map
 
 
-def first_look(image: Image, point: Array, box: Array | None, companions: list[Body]) -> FirstLook | None:
+def first_look(
+    image: Image, point: Array, box: Array | None, companions: list[Companion]
+) -> FirstLook | None:
     """Learn the animal at `point` (2,) px, inside `box` (4,) px where one is given; None where nothing stands
     out.
     """
@@ -62,7 +76,7 @@ def _fits(body: Body, point: Array, half_px: float) -> float:
     return float(np.clip(2.4 - 1.6 * reach, 0.05, 1)) * float(np.clip(reach / 0.35, 0.2, 1))
 
 
-def _look_in_box(image: Image, point: Array, box: Array, companions: list[Body]) -> FirstLook | None:
+def _look_in_box(image: Image, point: Array, box: Array, companions: list[Companion]) -> FirstLook | None:
     frame_shape = (image.shape[0], image.shape[1])
     rough = body_of_box(box)
     window = window_round(rough.centre, rough.length_px, WORKING_LENGTH_PX / rough.length_px, frame_shape)
@@ -72,42 +86,50 @@ def _look_in_box(image: Image, point: Array, box: Array, companions: list[Body])
     if float(pixels.std(axis=(0, 1)).max()) < 1.0:
         return None
     lab = np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2LAB), dtype=np.uint8)
-    others = [in_window(other, window) for other in companions]
-    prior, outside = _place_prior(window, point, box, others)
+    others = [in_window(other.body, window) for other in companions]
+    boxes = [None if other.box is None else box_in_window(other.box, window) for other in companions]
+    prior, outside = _place_prior(window, point, box, others, boxes)
     if int(outside.sum()) < 32:
         return None
     appearance = Appearance(lab, prior, outside)
-    sight = _settle(appearance.evidence(lab), prior, in_window(rough, window), others, window, frame_shape)
+    evidence = appearance.evidence(lab)
+    own, others = _settle_pod(
+        evidence, prior, in_window(rough, window), box_in_window(box, window), others, boxes
+    )
+    sight = segment(evidence, own, others, window.open_edges(frame_shape))
     if sight is None:
         return None
+    sight = segment(evidence, sight.body, others, window.open_edges(frame_shape)) or sight
     template = body_patch(np.ascontiguousarray(lab[..., 0]), sight.body)
-    return FirstLook(appearance, window, sight, in_frame(sight.body, window), template)
+    settled = [in_frame(other, window) for other in others]
+    return FirstLook(appearance, window, sight, in_frame(sight.body, window), settled, template)
 
 
-def _settle(
-    evidence: Map,
-    prior: Map,
-    rough: Body,
-    others: list[Body],
-    window: Window,
-    frame_shape: tuple[int, int],
-) -> Sight | None:
-    """From the box's ellipse to the body's own: moments of the evidence in the box, then of the mask."""
+def _settle_pod(
+    evidence: Map, prior: Map, rough: Body, box: Array, others: list[Body], boxes: list[Array | None]
+) -> tuple[Body, list[Body]]:
+    """From boxes to bodies: moments of the evidence in the own box, then shares of all that the pod shows."""
     weights = np.where(prior > 0.2, np.maximum(evidence, 0) * prior, 0).astype(np.float32)
-    body = body_of_weights(weights, rough.angle_rad)
-    sight = None
-    for _ in range(3):
-        if body is None or body.area_px < 8:
-            return None
-        sight = segment(evidence, body, others, window.open_edges(frame_shape))
-        if sight is None:
-            return None
-        body = sight.body
-    return sight
+    own = body_of_weights(weights, rough.angle_rad)
+    if own is None or own.area_px < 8:
+        own = rough
+    size = (evidence.shape[1], evidence.shape[0])
+    # Only those wholly in view: half an animal would give half an ellipse.
+    whole = [
+        i
+        for i, other in enumerate(others)
+        if (other.box[:2] > -2).all() and (other.box[2:] < np.array(size) + 2).all()
+    ]
+    rooms: list[Array | None] = [box, *(boxes[i] for i in whole)]
+    bodies = settle(evidence, [own, *(others[i] for i in whole)], rooms)
+    settled = list(others)
+    for place, index in enumerate(whole):
+        settled[index] = bodies[place + 1]
+    return bodies[0], settled
 
 
 def _place_prior(
-    window: Window, point: Array, box: Array, others: list[Body]
+    window: Window, point: Array, box: Array, others: list[Body], boxes: list[Array | None]
 ) -> tuple[Map, NDArray[np.bool_]]:
     """How likely each window pixel is the animal's by place, and which ones are water for sure."""
     width, height = window.size
@@ -119,10 +141,15 @@ def _place_prior(
     from_point = np.hypot((u - middle[0])[None, :] / half[0], (v - middle[1])[:, None] / half[1])
     prior = np.where(in_box < BOX_EDGE, np.clip(0.75 - 0.4 * from_point, 0.05, 0.75), 0)
     outside = in_box > BOX_EDGE
-    for other in others:
+    for other, theirs in zip(others, boxes, strict=True):
         radius = other.radius(window.size)
-        prior = np.where(radius < 1, np.minimum(prior, 0.1), prior)
+        prior = np.where(radius < 0.7, np.minimum(prior, 0.1), prior)
         outside &= radius > 1.4
+        if theirs is not None:
+            away = np.abs(u - (theirs[0] + theirs[2]) / 2)[None, :] > 0.55 * (theirs[2] - theirs[0])
+            outside &= away | (
+                np.abs(v - (theirs[1] + theirs[3]) / 2)[:, None] > 0.55 * (theirs[3] - theirs[1])
+            )
     return prior.astype(np.float32), outside
 
 
@@ -130,6 +157,11 @@ def in_window(body: Body, window: Window) -> Body:
     """A body in frame px as one in window px."""
     scaled = body.scaled(window.scale)
     return Body(window.to_window(body.centre), scaled.length_px, scaled.width_px, body.angle_rad)
+
+
+def box_in_window(box: Array, window: Window) -> Array:
+    """A (4,) box in frame px as one in window px."""
+    return window.to_window(box.reshape(2, 2)).ravel()
 
 
 def in_frame(body: Body, window: Window) -> Body:

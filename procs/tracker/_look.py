@@ -9,10 +9,11 @@ from numpy.typing import NDArray
 from procs.tracker._appearance import Appearance
 from procs.tracker._body import Body, body_of_weights
 from procs.tracker._first_look import WORKING_LENGTH_PX, FirstLook, in_window
-from procs.tracker._sight import COMPANION_REACH, Map, Sight, body_patch, likeness, locate, segment
+from procs.tracker._pod import claimed_by, within_reach
+from procs.tracker._sight import Map, Sight, body_patch, likeness, locate, segment
 from procs.tracker._window import Window, window_round
 
-__all__ = ["LEAST_SEPARATION", "Look", "Reference", "find_again", "followed", "take_look"]
+__all__ = ["LEAST_SEPARATION", "Look", "Reference", "find_again", "take_look"]
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -45,64 +46,58 @@ class Reference:
 
 @dataclass(frozen=True)
 class Look:
-    """`located` and `others` are bodies in window px."""
+    """One look; `located` and `others` are bodies in window px. `sight` is None where the animal was not
+    seen.
+    """
 
     window: Window
     lab: Image
     evidence: Map
     located: Body
     others: list[Body]
-    sight: Sight
-    patch: Map
+    sight: Sight | None
+    patch: Map | None
     score: float
 
 
 def take_look(
-    image: Image, reference: Reference, body: Body, companions: list[Body], search_px: float
+    image: Image,
+    reference: Reference,
+    body: Body,
+    companions: list[Body],
+    search_px: float,
+    *,
+    is_guess: bool,
 ) -> Look | None:
-    """Look for `body` (frame px) within `search_px` of its place; None where nothing is seen.
+    """Look for `body` (frame px) within `search_px` of its place; None where the picture shows nothing there.
 
-    `companions` are the other animals, frame px.
+    `companions` are the other animals, frame px; `is_guess`: the place is a prediction from some time ago,
+    and what the companions' ellipses cover is theirs.
     """
+    frame_shape = (image.shape[0], image.shape[1])
     half_px = 0.65 * body.length_px + search_px
     scale = min(1.0, WORKING_LENGTH_PX / body.length_px, WINDOW_MOST_PX / (2 * half_px))
-    window = window_round(body.centre, half_px, scale, (image.shape[0], image.shape[1]))
+    window = window_round(body.centre, half_px, scale, frame_shape)
     if window is None:
         return None
     pixels = window.cut(image)
     if float(cv2.meanStdDev(pixels)[1].max()) < FLAT_LEVELS:
         return None
     lab = np.asarray(cv2.cvtColor(pixels, cv2.COLOR_BGR2LAB), dtype=np.uint8)
-    others = [in_window(other, window) for other in companions]
     evidence = reference.appearance.evidence(lab)
+    others = [in_window(other, window) for other in companions]
     expected = in_window(body, window)
-    free = _without(evidence, expected, others)
+    free = evidence
+    if any(within_reach(other, window.size) for other in others):
+        # Their pixels are made water, so that the ellipse does not slide onto them.
+        claimed = claimed_by(others, expected.radius(window.size), outright=is_guess)
+        free = np.where(claimed, np.float32(-0.3), evidence)
     located = replace(expected, centre=locate(free, expected, search_px * window.scale))
-    sight = segment(evidence, located, others, window.open_edges((image.shape[0], image.shape[1])))
+    sight = segment(evidence, located, others, window.open_edges(frame_shape), outright=is_guess)
     if sight is None or sight.separation < LEAST_SEPARATION:
-        return None
+        return Look(window, lab, evidence, located, others, None, None, 0.0)
     patch = body_patch(np.ascontiguousarray(lab[..., 0]), sight.body)
     return Look(window, lab, evidence, located, others, sight, patch, _score(reference, sight, patch))
-
-
-def _without(evidence: Map, own: Body, others: list[Body]) -> Map:
-    """The evidence with the other animals' pixels made water, so that the ellipse does not slide onto
-    them.
-    """
-    size = (evidence.shape[1], evidence.shape[0])
-    near = [other for other in others if _may_reach(other, size)]
-    if not near:
-        return evidence
-    radius, free = own.radius(size), evidence.copy()
-    for other in near:
-        theirs = other.radius(size)
-        free[(theirs < radius) & (theirs < COMPANION_REACH)] = -0.3
-    return free
-
-
-def _may_reach(other: Body, size: tuple[int, int]) -> bool:
-    reach = COMPANION_REACH * other.length_px / 2
-    return bool(-reach < other.centre[0] < size[0] + reach and -reach < other.centre[1] < size[1] + reach)
 
 
 def _score(reference: Reference, sight: Sight, patch: Map) -> float:
@@ -113,33 +108,6 @@ def _score(reference: Reference, sight: Sight, patch: Map) -> float:
     off = np.log(max(sight.area_ratio, 1e-3) / reference.area_ratio) / AREA_SPREAD
     alike = max(0.0, likeness(patch, reference.template, either_way=True))
     return float(stands_out * np.exp(-0.5 * off * off) * (1 - LIKENESS_SHARE + LIKENESS_SHARE * alike))
-
-
-def followed(look: Look, own: Body) -> list[Body]:
-    """The companions (window px) moved half-way to the evidence that is nearer to them than to `own`."""
-    size = (look.evidence.shape[1], look.evidence.shape[0])
-    own_radius = own.radius(size)
-    moved = []
-    for other in look.others:
-        if not _may_reach(other, size):
-            moved.append(other)
-            continue
-        radius = other.radius(size)
-        theirs = (radius < 1.5) & (radius < own_radius) & (look.evidence > 0)
-        seen = body_of_weights(theirs.astype(np.float32), other.angle_rad)
-        inside = other.area_px * 0.3 < theirs.sum()
-        if seen is None or not inside:
-            moved.append(other)
-            continue
-        turn = 0.3 * (seen.angle_rad - other.angle_rad)
-        moved.append(
-            replace(
-                other,
-                centre=other.centre + 0.5 * (seen.centre - other.centre),
-                angle_rad=other.angle_rad + turn,
-            )
-        )
-    return moved
 
 
 def find_again(image: Image, reference: Reference, body: Body, companions: list[Body]) -> Body | None:

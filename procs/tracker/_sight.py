@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from procs.tracker._body import Body, body_of_weights
+from procs.tracker._pod import claimed_by
 
 __all__ = ["Sight", "body_patch", "likeness", "locate", "outline_of", "segment"]
 
@@ -18,7 +19,6 @@ RING = (1.25, 2.0)  # normalised radii of the water ring that a body must stand 
 PRIOR_EDGE = 1.2  # radius at which place says nothing; flukes and flippers reach a little beyond the ellipse
 PRIOR_SLOPE = 1.3  # evidence a radius: at twice the ellipse no evidence is enough
 PRIOR_TOP = 0.3  # at most this much credit for place alone
-COMPANION_REACH = 1.6  # radius of a companion within which its pixels may be its own
 PATCH = (48, 20)  # px, length and width of the body-aligned picture that is compared with the first one
 
 
@@ -64,15 +64,19 @@ def locate(evidence: Map, body: Body, search_px: float, stride: int = 2) -> Arra
 
 
 def segment(
-    evidence: Map, body: Body, companions: list[Body], open_edges: tuple[bool, bool, bool, bool]
+    evidence: Map,
+    body: Body,
+    companions: list[Body],
+    open_edges: tuple[bool, bool, bool, bool],
+    *,
+    outright: bool = False,
 ) -> Sight | None:
-    """The pixels of the animal whose prior is `body`; None where nothing stands out at its place."""
-    size = (evidence.shape[1], evidence.shape[0])
-    radius = body.radius(size)
-    claimed = np.zeros(radius.shape, dtype=np.bool_)
-    for other in companions:
-        theirs = other.radius(size)
-        claimed |= (theirs < radius) & (theirs < COMPANION_REACH)
+    """The pixels of the animal whose prior is `body`; None where nothing stands out at its place.
+
+    `companions` claim their pixels, `outright` even against a nearer own ellipse. All in window px.
+    """
+    radius = body.radius((evidence.shape[1], evidence.shape[0]))
+    claimed = claimed_by(companions, radius, outright=outright)
     prior = np.minimum(PRIOR_SLOPE * (PRIOR_EDGE - radius), PRIOR_TOP)
     candidate = (evidence + prior > 0) & (evidence > 0) & ~claimed
     mask = _pieces_on_body(candidate, radius)

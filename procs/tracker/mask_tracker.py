@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from procs.tracker._body import Body, body_of_box
+from procs.tracker._camera_motion import CameraMotion
 from procs.tracker._checks import (
     check_boxes,
     check_companions,
@@ -29,9 +30,10 @@ from procs.tracker._checks import (
     check_motion,
     check_point,
 )
-from procs.tracker._first_look import FirstLook, first_look, in_frame
-from procs.tracker._look import LEAST_SEPARATION, Look, Reference, find_again, followed, take_look
+from procs.tracker._first_look import Companion, FirstLook, first_look, in_frame
+from procs.tracker._look import LEAST_SEPARATION, Look, Reference, find_again, take_look
 from procs.tracker._motion import Motion
+from procs.tracker._pod import followed, refreshed
 from procs.tracker._sight import Sight, outline_of
 from procs.tracker._window import Window
 
@@ -54,6 +56,7 @@ LEARN_SCORE = 0.6  # the models learn only from looks this good
 LEARN_EVERY = 3  # frames
 LEARN_RATE = 0.03
 WATER_RATE = 0.2  # the water's colour follows the camera's exposure within a second
+LEAST_OVERLAP = 0.35  # of box and body: below this the detection contradicts the mask
 STRIKES = 2  # detections running that contradict the mask before they are believed
 OUTLINE_MOST = 64  # corners, what track_t carries
 
@@ -114,8 +117,11 @@ class MaskTracker:
             guess = np.concatenate([at, at]) + 0.1 * shape[0] * np.array([-1, -1, 1, 1])
         self._body = replace(body_of_box(guess), centre=at)
         self._motion = Motion(at)
-        self._companions = self._as_bodies(others, 0.0)
-        first = first_look(image, at, own_box, self._companions)
+        self._camera = CameraMotion()
+        self._camera.between(image)
+        companions_there = self._as_companions(others, 0.0)
+        self._companions = [other.body for other in companions_there]
+        first = first_look(image, at, own_box, companions_there)
         if first is None or first.sight.separation < LEAST_SEPARATION:
             return self._unseen_track()
         return self._adopt(first)
@@ -145,41 +151,42 @@ class MaskTracker:
         camera = check_motion(image_motion, self._shape)
         heard = check_boxes(boxes)
         others = None if companions is None else check_companions(companions)
+        if camera is None:
+            camera = self._camera.between(image)
+        else:
+            self._camera.forget()
         self._predict(dt, camera)
-        if others is not None:
-            self._companions = self._as_bodies(others, boxes_age_s)
-        retaken = self._hear(image, heard, boxes_age_s) if len(heard) else None
+        fresh = None if others is None else self._as_companions(others, boxes_age_s)
+        if fresh is not None:
+            self._companions = refreshed(self._companions, [other.body for other in fresh])
+        retaken = self._hear(image, heard, boxes_age_s, fresh) if len(heard) else None
         track = retaken if retaken is not None else self._see(image, dt)
         self._motion.remember()
         return track
 
-    def _predict(self, dt_s: float, camera: Array | None) -> None:
+    def _predict(self, dt_s: float, camera: Array) -> None:
         self._frames += 1
-        before = self._motion.centre
         self._motion.predict(dt_s, camera, self._state == "tracking")
-        if camera is not None:
-            self._body = self._body.through(camera)
-            self._companions = [other.through(camera) for other in self._companions]
-        else:
-            # What moves the picture moves all animals; their own motion is slow beside it.
-            step = self._motion.centre - before
-            self._companions = [replace(other, centre=other.centre + step) for other in self._companions]
-        self._body = replace(self._body, centre=self._motion.centre)
+        self._body = replace(self._body.through(camera), centre=self._motion.centre)
+        self._companions = [other.through(camera) for other in self._companions]
 
-    def _as_bodies(self, places: Array, age_s: float) -> list[Body]:
-        """Boxes (K, 4) or points (K, 2) of other animals as ellipses; a point gets this animal's size."""
+    def _as_companions(self, places: Array, age_s: float) -> list[Companion]:
+        """Boxes (K, 4) or points (K, 2) of other animals with first ellipses; a point gets this animal's
+        size.
+        """
         if places.shape[1] == 4:
-            return [body_of_box(self._motion.carried(box, age_s)) for box in places]
+            carried = [self._motion.carried(box, age_s) for box in places]
+            return [Companion(body_of_box(box), box) for box in carried]
         side = float(np.sqrt(self._body.length_px * self._body.width_px))
-        return [Body(point, side, side, 0.0) for point in places]
+        return [Companion(Body(point, side, side, 0.0), None) for point in places]
 
-    def _hear(self, image: Image, boxes: Array, age_s: float) -> Track | None:
+    def _hear(self, image: Image, boxes: Array, age_s: float, fresh: list[Companion] | None) -> Track | None:
         """Weigh the detector's boxes against the mask; the new track where they win, else None."""
         carried = np.array([self._motion.carried(box, age_s) for box in boxes])
         centres = (carried[:, :2] + carried[:, 2:]) / 2
         nearest = int(np.argmin(np.hypot(*(centres - self._body.centre).T)))
         box, centre = carried[nearest], centres[nearest]
-        agrees = _overlap(box, self._body.box) > 0.25
+        agrees = _overlap(box, self._body.box) > LEAST_OVERLAP
         if agrees and self._state == "tracking":
             self._strikes = 0
             # Boxes are loose: only a size that is far off is drawn towards theirs.
@@ -194,7 +201,8 @@ class MaskTracker:
             return None
         height, width = image.shape[:2]
         inside = np.clip(centre, 0, [width - 1, height - 1])
-        first = first_look(image, inside, box, self._companions)
+        others = fresh if fresh is not None else [Companion(other, None) for other in self._companions]
+        first = first_look(image, inside, box, others)
         if first is not None and first.sight.separation >= LEAST_SEPARATION:
             return self._adopt(first)
         if self._state != "tracking":
@@ -208,7 +216,7 @@ class MaskTracker:
             self._motion.jump(first.body.centre)
         else:
             self._motion.centre = first.body.centre
-        self._body = first.body
+        self._body, self._companions = first.body, first.companions
         self._reference = Reference.of(first)
         self._state, self._score, self._unseen_s = "tracking", 1.0, 0.0
         self._strikes = self._found_running = 0
@@ -221,7 +229,12 @@ class MaskTracker:
         """Look, judge, and move the state on."""
         look = self._find(image)
         least = KEEP_SCORE if self._state == "tracking" else REGAIN_SCORE
-        if look is None or look.score < least:
+        if look is not None and self._frames % LEARN_EVERY == 0:
+            own = None if look.sight is None else look.sight.body
+            self._companions = [
+                in_frame(other, look.window) for other in followed(look.evidence, own, look.others)
+            ]
+        if look is None or look.sight is None or look.score < least:
             self._found_running = 0
             self._score = 0.0 if look is None else look.score
             self._unseen_s += dt_s
@@ -231,7 +244,7 @@ class MaskTracker:
                 self._state = "predicted"
             return self._unseen_track()
         self._score = look.score
-        self._take_in(look, dt_s)
+        self._take_in(look, look.sight, dt_s)
         if self._state == "lost":
             self._unseen_s += dt_s
             self._found_running += 1
@@ -254,23 +267,20 @@ class MaskTracker:
             self._body = found
         elif self._state != "lost":
             search += SEARCH_GROWTH * self._unseen_s * self._body.length_px
-        return take_look(image, reference, self._body, self._companions, search)
+        is_guess = self._state != "tracking"
+        return take_look(image, reference, self._body, self._companions, search, is_guess=is_guess)
 
-    def _take_in(self, look: Look, dt_s: float) -> None:
-        """Place, size, direction, colours and companions after a look that counts."""
-        seen = in_frame(look.sight.body, look.window)
-        if look.sight.cut_by_edge:
+    def _take_in(self, look: Look, sight: Sight, dt_s: float) -> None:
+        """Place, size, direction and models after a look that counts."""
+        seen = in_frame(sight.body, look.window)
+        if sight.cut_by_edge:
             self._motion.correct(in_frame(look.located, look.window).centre, dt_s)
         else:
             self._motion.correct(seen.centre, dt_s)
             self._body = _eased(self._body, seen)
         self._body = replace(self._body, centre=self._motion.centre)
-        reference = self._reference
-        if reference is None or self._frames % LEARN_EVERY:
-            return
-        self._companions = [in_frame(other, look.window) for other in followed(look, look.sight.body)]
-        if self._score >= LEARN_SCORE:
-            _learn(reference, look)
+        if self._reference is not None and not self._frames % LEARN_EVERY and self._score >= LEARN_SCORE:
+            _learn(self._reference, look, sight)
 
     def _seen_track(self, window: Window, sight: Sight) -> Track:
         assert self._shape is not None
@@ -316,20 +326,21 @@ def _eased(body: Body, seen: Body) -> Body:
     )
 
 
-def _learn(reference: Reference, look: Look) -> None:
+def _learn(reference: Reference, look: Look, sight: Sight) -> None:
     """Move the colour models, the template and the expectations a little towards a good look."""
-    radius = look.sight.body.radius(look.window.size)
-    outside = (radius > 1.5) & ~look.sight.mask
+    radius = sight.body.radius(look.window.size)
+    outside = (radius > 1.5) & ~sight.mask
     for other in look.others:
         outside &= other.radius(look.window.size) > 1.4
     if int(outside.sum()) < 64:
         return
-    inside = look.sight.mask & (radius < 1.1)
+    inside = sight.mask & (radius < 1.1)
     reference.appearance.follow_water(look.lab, outside, WATER_RATE)
     reference.appearance.adapt(look.lab, inside, outside, LEARN_RATE)
-    reference.template += np.float32(LEARN_RATE) * (look.patch - reference.template)
-    reference.separation += LEARN_RATE * (look.sight.separation - reference.separation)
-    reference.area_ratio += LEARN_RATE * (look.sight.area_ratio - reference.area_ratio)
+    if look.patch is not None:
+        reference.template += np.float32(LEARN_RATE) * (look.patch - reference.template)
+    reference.separation += LEARN_RATE * (sight.separation - reference.separation)
+    reference.area_ratio += LEARN_RATE * (sight.area_ratio - reference.area_ratio)
 
 
 def _overlap(a: Array, b: Array) -> float:
