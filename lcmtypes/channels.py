@@ -60,7 +60,10 @@ CHANNELS = (
     Channel(LOG_STATE, podwatch.log_state_t, rate_hz=1, max_age_s=3),
     Channel(HEARTBEAT, podwatch.heartbeat_t, rate_hz=9, max_age_s=3),
 )
-BY_NAME = {channel.name: channel for channel in CHANNELS}
+# What the simulator says on the world's own group and in truth.mcap; it is on no drone's bus.
+WORLD_STATE = "WORLD_STATE"
+WORLD_CHANNELS = (Channel(WORLD_STATE, podwatch.world_state_t, rate_hz=50),)
+BY_NAME = {channel.name: channel for channel in (*CHANNELS, *WORLD_CHANNELS)}
 CROSSING = tuple(channel for channel in CHANNELS if channel.crosses)
 
 

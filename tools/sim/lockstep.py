@@ -45,13 +45,11 @@ class LockstepFleet:
         self._cuts: dict[tuple[int, int], bool] = {}
         self._ether = MemoryEther(
             np.random.default_rng([seed, 5]),
+            self._deliver_after,
             latency_s=plan.mission.world.radio_latency_s,
             loss=plan.mission.world.radio_loss,
-            schedule=lambda delay_s, action: self.queue.schedule(
-                self.queue.now_us + round(delay_s * 1e6), action
-            ),
-            blocked=lambda sender, receiver: self._cuts.get((sender, receiver), False),
         )
+        self._ether.blocked = lambda sender, receiver: self._cuts.get((sender, receiver), False)
         pairs = {drone_id: link_pair(self._deliver, drone_id) for drone_id in roster}
         self.world = World(plan.world_settings(), {drone_id: pair[1] for drone_id, pair in pairs.items()})
         self._state = self.world.state()
@@ -98,6 +96,7 @@ class LockstepFleet:
             drone_id=drone_id,
             mission=self.plan.mission,
             seed=self.plan.mission.seed,
+            run_dir=str(self.plan.folder),
             log_path=str(self.plan.log_path(drone_id)),
         )
         drivers = self._drivers(drone_id, link)
@@ -124,7 +123,7 @@ class LockstepFleet:
             "detector": lambda _process: BoxDetector(seed) if boxes else Detector(),
             "tracker": lambda _process: BoxTracker(seed) if boxes else MaskTracker(),
             "autopilot": lambda _process: link,
-            "radio": lambda _process: self._ether.radio(drone_id),
+            "radio": lambda _process: self._ether.radio(drone_id, self.plan.mission.roster),
         }
 
     def _look(self) -> tuple[world_state_t, float, float]:
@@ -132,6 +131,9 @@ class LockstepFleet:
 
     def _deliver(self, action: Callable[[], None]) -> None:
         self.queue.schedule(self.queue.now_us + LINK_DELAY_US, action)
+
+    def _deliver_after(self, delay_s: float, action: Callable[[], None]) -> None:
+        self.queue.schedule(self.queue.now_us + round(delay_s * 1e6), action)
 
     def _step_world(self) -> None:
         self.world.step_to(self.queue.now_us)

@@ -5,13 +5,12 @@ from pathlib import Path
 
 import cv2
 
-from lcmtypes import make
+from lcmtypes import channels, make
 from lcmtypes.podwatch import world_animal_t, world_state_t
 from logs.writer import LogWriter
 
-__all__ = ["WORLD_CHANNEL", "TruthWriter", "labelled_animals"]
+__all__ = ["TruthWriter", "labelled_animals"]
 
-WORLD_CHANNEL = "WORLD_STATE"
 CSV_PERIOD_US = 200_000
 
 
@@ -30,7 +29,7 @@ class TruthWriter:
         """Keep one state of the world."""
         if self._animals is not None:
             state.animals, state.n_animals = self._animals, len(self._animals)
-        self._log.write(WORLD_CHANNEL, state.encode(), state.utime)
+        self._log.write(channels.WORLD_STATE, state.encode(), state.utime)
         if state.utime < self._next_row_us:
             return
         self._next_row_us += CSV_PERIOD_US
