@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from procs.tracker._appearance import Appearance
 from procs.tracker._body import Body, body_of_box, body_of_weights
-from procs.tracker._pod import settle
+from procs.tracker._pod import claimed_by, settle
 from procs.tracker._sight import Map, Sight, body_patch, segment
 from procs.tracker._window import Window, window_round
 
@@ -22,6 +22,8 @@ Image = NDArray[np.uint8]
 WORKING_LENGTH_PX = 64.0  # window px: longer bodies are looked at in a reduced picture
 # Without a box: sides of the squares tried round the point, as shares of the frame's height.
 GUESSED_SIDES = (0.08, 0.16, 0.3, 0.5)
+POD_REACH = 1.8  # of the own length: companions this near are told apart by their pixels
+POD_LENGTH_PX = 40.0  # window px of a body in that wider window
 BOX_EDGE = 1.12  # boxes are loose, seldom tight: this far beyond its edge no pixel is thought the animal's
 
 
@@ -92,40 +94,72 @@ def _look_in_box(image: Image, point: Array, box: Array, companions: list[Compan
     if int(outside.sum()) < 32:
         return None
     appearance = Appearance(lab, prior, outside)
-    evidence = appearance.evidence(lab)
-    own, others = _settle_pod(
-        evidence, prior, in_window(rough, window), box_in_window(box, window), others, boxes
+    own, around = _settle_pod(
+        image, appearance, appearance.evidence(lab), prior, window, rough, box, companions
     )
-    sight = segment(evidence, own, others, window.open_edges(frame_shape))
+    others = [in_window(other, window) for other in around]
+    body = in_window(own, window)
+    sight = None
+    for _ in range(2):
+        claimed = claimed_by(others, body.radius(window.size), outright=False)
+        latest = segment(appearance.evidence(lab), body, claimed, window.open_edges(frame_shape))
+        if latest is None:
+            break
+        sight, body = latest, latest.body
     if sight is None:
         return None
-    sight = segment(evidence, sight.body, others, window.open_edges(frame_shape)) or sight
     template = body_patch(np.ascontiguousarray(lab[..., 0]), sight.body)
-    settled = [in_frame(other, window) for other in others]
-    return FirstLook(appearance, window, sight, in_frame(sight.body, window), settled, template)
+    return FirstLook(appearance, window, sight, in_frame(sight.body, window), around, template)
 
 
 def _settle_pod(
-    evidence: Map, prior: Map, rough: Body, box: Array, others: list[Body], boxes: list[Array | None]
+    image: Image,
+    appearance: Appearance,
+    evidence: Map,
+    prior: Map,
+    window: Window,
+    rough: Body,
+    box: Array,
+    companions: list[Companion],
 ) -> tuple[Body, list[Body]]:
-    """From boxes to bodies: moments of the evidence in the own box, then shares of all that the pod shows."""
+    """From boxes to bodies, frame px: moments of the own box's evidence, then shares of all that the pod
+    shows.
+    """
     weights = np.where(prior > 0.2, np.maximum(evidence, 0) * prior, 0).astype(np.float32)
-    own = body_of_weights(weights, rough.angle_rad)
-    if own is None or own.area_px < 8:
-        own = rough
-    size = (evidence.shape[1], evidence.shape[0])
-    # Only those wholly in view: half an animal would give half an ellipse.
-    whole = [
-        i
-        for i, other in enumerate(others)
-        if (other.box[:2] > -2).all() and (other.box[2:] < np.array(size) + 2).all()
-    ]
-    rooms: list[Array | None] = [box, *(boxes[i] for i in whole)]
-    bodies = settle(evidence, [own, *(others[i] for i in whole)], rooms)
-    settled = list(others)
-    for place, index in enumerate(whole):
-        settled[index] = bodies[place + 1]
-    return bodies[0], settled
+    own = body_of_weights(weights, 0.0)
+    guess = rough if own is None or own.area_px < 8 else in_frame(own, window)
+    wide = window_round(
+        rough.centre,
+        POD_REACH * rough.length_px,
+        POD_LENGTH_PX / rough.length_px,
+        (image.shape[0], image.shape[1]),
+    )
+    if wide is None or not companions:
+        return guess, [other.body for other in companions]
+    shown = appearance.evidence(np.asarray(cv2.cvtColor(wide.cut(image), cv2.COLOR_BGR2LAB), dtype=np.uint8))
+    # Only those in view: half an animal would give half an ellipse.
+    near = [i for i, other in enumerate(companions) if _is_in(wide, other.body)]
+    rooms: list[Array | None] = [box_in_window(box, wide)]
+    bodies = [in_window(guess, wide)]
+    for index in near:
+        theirs = companions[index].box
+        rooms.append(None if theirs is None else box_in_window(theirs, wide))
+        bodies.append(in_window(companions[index].body, wide))
+    settled = [in_frame(body, wide) for body in settle(shown, bodies, rooms)]
+    around = [other.body for other in companions]
+    for place, index in enumerate(near):
+        around[index] = settled[place + 1]
+    return settled[0], around
+
+
+def _is_in(window: Window, body: Body) -> bool:
+    left, top, right, bottom = body.box
+    return bool(
+        left > window.left - 2
+        and top > window.top - 2
+        and right < window.right + 2
+        and bottom < window.bottom + 2
+    )
 
 
 def _place_prior(

@@ -8,12 +8,12 @@ from numpy.typing import NDArray
 
 from procs.tracker._appearance import Appearance
 from procs.tracker._body import Body, body_of_weights
-from procs.tracker._first_look import WORKING_LENGTH_PX, FirstLook, in_window
-from procs.tracker._pod import claimed_by, within_reach
+from procs.tracker._first_look import WORKING_LENGTH_PX, FirstLook, in_frame, in_window
+from procs.tracker._pod import claimed_by, followed
 from procs.tracker._sight import Map, Sight, body_patch, likeness, locate, segment
 from procs.tracker._window import Window, window_round
 
-__all__ = ["LEAST_SEPARATION", "Look", "Reference", "find_again", "take_look"]
+__all__ = ["LEAST_SEPARATION", "Look", "Reference", "find_again", "look_for_companion", "take_look"]
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -21,6 +21,8 @@ Image = NDArray[np.uint8]
 LEAST_SEPARATION = 0.12  # of evidence, below which nothing stands out: noise alone reaches about 0.05
 FLAT_LEVELS = 1.0  # grey levels of standard deviation: a covered lens or a dead camera shows less
 WINDOW_MOST_PX = 176.0  # window side: wider searches are done at lower resolution
+COMPANION_LENGTH_PX = 32.0  # window px of a companion
+COMPANION_SEARCH_PX = 12.0  # beyond its ellipse
 LIKENESS_SHARE = 0.2  # of the score; light only, since glints and foam change and a whale rolls
 AREA_SPREAD = 0.5  # of the logarithm of the area: a mask of half or double size keeps 0.4 of its score
 FOUND_LENGTH_PX = 24.0  # window px: the body's length in a search of the whole frame ...
@@ -87,17 +89,31 @@ def take_look(
     evidence = reference.appearance.evidence(lab)
     others = [in_window(other, window) for other in companions]
     expected = in_window(body, window)
-    free = evidence
-    if any(within_reach(other, window.size) for other in others):
-        # Their pixels are made water, so that the ellipse does not slide onto them.
-        claimed = claimed_by(others, expected.radius(window.size), outright=is_guess)
-        free = np.where(claimed, np.float32(-0.3), evidence)
+    # Claims hold for the predicted places: an ellipse that slid towards a neighbour must not win its pixels
+    # thereby.
+    claimed = claimed_by(others, expected.radius(window.size), outright=is_guess)
+    free = np.where(claimed, np.float32(-0.3), evidence)
     located = replace(expected, centre=locate(free, expected, search_px * window.scale))
-    sight = segment(evidence, located, others, window.open_edges(frame_shape), outright=is_guess)
+    sight = segment(evidence, located, claimed, window.open_edges(frame_shape))
     if sight is None or sight.separation < LEAST_SEPARATION:
         return Look(window, lab, evidence, located, others, None, None, 0.0)
     patch = body_patch(np.ascontiguousarray(lab[..., 0]), sight.body)
     return Look(window, lab, evidence, located, others, sight, patch, _score(reference, sight, patch))
+
+
+def look_for_companion(image: Image, reference: Reference, body: Body, rivals: list[Body]) -> Body | None:
+    """Another animal's ellipse (frame px) after a coarse look at it, `rivals` being all the others; None if
+    unseen.
+    """
+    half_px = 0.75 * body.length_px + COMPANION_SEARCH_PX
+    scale = COMPANION_LENGTH_PX / body.length_px
+    window = window_round(body.centre, half_px, scale, (image.shape[0], image.shape[1]))
+    if window is None:
+        return None
+    lab = np.asarray(cv2.cvtColor(window.cut(image), cv2.COLOR_BGR2LAB), dtype=np.uint8)
+    evidence = reference.appearance.evidence(lab)
+    moved = followed(evidence, in_window(body, window), [in_window(rival, window) for rival in rivals])
+    return None if moved is None else in_frame(moved, window)
 
 
 def _score(reference: Reference, sight: Sight, patch: Map) -> float:

@@ -18,7 +18,8 @@ Mask = NDArray[np.bool_]
 CLAIM_REACH = 1.6  # radius of an ellipse within which pixels may be its own
 BOX_SLACK = 1.08  # boxes are drawn loose, seldom tight
 SETTLE_ROUNDS = 6
-FOLLOW_RATE = 0.5  # share of the seen place that a companion takes over a look
+FOLLOW_REACH = 1.5  # radius within which a companion is looked for
+FOLLOW_RATE = 0.7  # share of the seen place that a companion takes over a look
 TURN_RATE = 0.3
 SIZE_RATE = 0.1
 LEAST_SHARE = (
@@ -78,31 +79,25 @@ def claimed_by(others: list[Body], own_radius: Map, *, outright: bool) -> Mask:
     return claimed
 
 
-def followed(evidence: Map, own: Body | None, others: list[Body]) -> list[Body]:
-    """The others (window px) moved towards the evidence that is nearer to each than to any other animal."""
+def followed(evidence: Map, body: Body, rivals: list[Body]) -> Body | None:
+    """A companion (window px) moved towards the evidence that is nearer to it than to any rival; None if
+    unseen.
+    """
     size = (evidence.shape[1], evidence.shape[0])
-    shown = evidence > 0
-    near = [index for index, other in enumerate(others) if within_reach(other, size)]
-    rivals = ([] if own is None else [own.radius(size)]) + [others[index].radius(size) for index in near]
-    moved = list(others)
-    for place, index in enumerate(near):
-        other = others[index]
-        mine = place + (own is not None)
-        theirs = shown & (rivals[mine] < 1.4)
-        for rival, radius in enumerate(rivals):
-            if rival != mine:
-                theirs &= rivals[mine] < radius
-        cut = _touches_edge(theirs)
-        seen = body_of_weights(theirs.astype(np.float32), other.angle_rad)
-        if seen is None or cut or theirs.sum() < LEAST_SHARE * other.area_px:
-            continue
-        moved[index] = Body(
-            other.centre + FOLLOW_RATE * (seen.centre - other.centre),
-            other.length_px * (seen.length_px / other.length_px) ** SIZE_RATE,
-            other.width_px * (seen.width_px / other.width_px) ** SIZE_RATE,
-            other.angle_rad + TURN_RATE * (seen.angle_rad - other.angle_rad),
-        )
-    return moved
+    radius = body.radius(size)
+    theirs = (evidence > 0) & (radius < FOLLOW_REACH)
+    for rival in rivals:
+        if within_reach(rival, size):
+            theirs &= radius < rival.radius(size)
+    seen = body_of_weights(theirs.astype(np.float32), body.angle_rad)
+    if seen is None or _touches_edge(theirs) or theirs.sum() < LEAST_SHARE * body.area_px:
+        return None
+    return Body(
+        body.centre + FOLLOW_RATE * (seen.centre - body.centre),
+        body.length_px * (seen.length_px / body.length_px) ** SIZE_RATE,
+        body.width_px * (seen.width_px / body.width_px) ** SIZE_RATE,
+        body.angle_rad + TURN_RATE * (seen.angle_rad - body.angle_rad),
+    )
 
 
 def _touches_edge(mask: Mask) -> bool:

@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from procs.tracker._body import Body, body_of_weights
-from procs.tracker._pod import claimed_by
 
 __all__ = ["Sight", "body_patch", "likeness", "locate", "outline_of", "segment"]
 
@@ -64,24 +63,18 @@ def locate(evidence: Map, body: Body, search_px: float, stride: int = 2) -> Arra
 
 
 def segment(
-    evidence: Map,
-    body: Body,
-    companions: list[Body],
-    open_edges: tuple[bool, bool, bool, bool],
-    *,
-    outright: bool = False,
+    evidence: Map, body: Body, claimed: Mask, open_edges: tuple[bool, bool, bool, bool]
 ) -> Sight | None:
-    """The pixels of the animal whose prior is `body`; None where nothing stands out at its place.
+    """The pixels of the animal whose prior is `body` (window px); None where nothing stands out at its place.
 
-    `companions` claim their pixels, `outright` even against a nearer own ellipse. All in window px.
+    `claimed` (height, width): pixels of the other animals.
     """
     radius = body.radius((evidence.shape[1], evidence.shape[0]))
-    claimed = claimed_by(companions, radius, outright=outright)
     prior = np.minimum(PRIOR_SLOPE * (PRIOR_EDGE - radius), PRIOR_TOP)
     candidate = (evidence + prior > 0) & (evidence > 0) & ~claimed
     mask = _pieces_on_body(candidate, radius)
-    inside = (radius <= 1) & ~claimed
-    in_view = int(inside.sum())
+    # What a neighbour claims counts as missing: an animal that has dived under another is not seen.
+    in_view = int((radius <= 1).sum())
     if mask is None or in_view < 6:
         return None
     ring = (radius > RING[0]) & (radius < RING[1]) & ~claimed

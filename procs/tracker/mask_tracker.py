@@ -31,9 +31,9 @@ from procs.tracker._checks import (
     check_point,
 )
 from procs.tracker._first_look import Companion, FirstLook, first_look, in_frame
-from procs.tracker._look import LEAST_SEPARATION, Look, Reference, find_again, take_look
+from procs.tracker._look import LEAST_SEPARATION, Look, Reference, find_again, look_for_companion, take_look
 from procs.tracker._motion import Motion
-from procs.tracker._pod import followed, refreshed
+from procs.tracker._pod import refreshed
 from procs.tracker._sight import Sight, outline_of
 from procs.tracker._window import Window
 
@@ -55,6 +55,7 @@ TURN_RATE = 0.5  # share of the seen direction taken over a frame
 LEARN_SCORE = 0.6  # the models learn only from looks this good
 LEARN_EVERY = 3  # frames
 LEARN_RATE = 0.03
+COMPANION_EVERY = 3  # frames: a third of the rate holds the others, which only have to be told apart
 WATER_RATE = 0.2  # the water's colour follows the camera's exposure within a second
 LEAST_OVERLAP = 0.35  # of box and body: below this the detection contradicts the mask
 STRIKES = 2  # detections running that contradict the mask before they are believed
@@ -229,11 +230,7 @@ class MaskTracker:
         """Look, judge, and move the state on."""
         look = self._find(image)
         least = KEEP_SCORE if self._state == "tracking" else REGAIN_SCORE
-        if look is not None and self._frames % LEARN_EVERY == 0:
-            own = None if look.sight is None else look.sight.body
-            self._companions = [
-                in_frame(other, look.window) for other in followed(look.evidence, own, look.others)
-            ]
+        self._follow_companion(image)
         if look is None or look.sight is None or look.score < least:
             self._found_running = 0
             self._score = 0.0 if look is None else look.score
@@ -269,6 +266,16 @@ class MaskTracker:
             search += SEARCH_GROWTH * self._unseen_s * self._body.length_px
         is_guess = self._state != "tracking"
         return take_look(image, reference, self._body, self._companions, search, is_guess=is_guess)
+
+    def _follow_companion(self, image: Image) -> None:
+        """Look for one of the others, each in its turn and none more often than every third frame."""
+        turn = self._frames % max(COMPANION_EVERY, len(self._companions))
+        if self._reference is None or turn >= len(self._companions):
+            return
+        rivals = [self._body, *self._companions[:turn], *self._companions[turn + 1 :]]
+        moved = look_for_companion(image, self._reference, self._companions[turn], rivals)
+        if moved is not None:
+            self._companions[turn] = moved
 
     def _take_in(self, look: Look, sight: Sight, dt_s: float) -> None:
         """Place, size, direction and models after a look that counts."""
