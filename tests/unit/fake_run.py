@@ -129,7 +129,9 @@ class FakeRun:
         ]
         return float(u_px), float(v_px)
 
-    def box(self, drone: int, animal: int, t_s: float) -> podwatch.box_t | None:
+    def box(
+        self, drone: int, animal: int, t_s: float, to_image: Array | None = None
+    ) -> podwatch.box_t | None:
         """The box round an animal's body in a drone's image, None where its middle is not in it."""
         n_m, e_m, heading = self.animal(animal, t_s)
         along = LENGTH_M / 2 * np.array([np.cos(heading), np.sin(heading)])
@@ -137,7 +139,9 @@ class FakeRun:
         outline = np.array([n_m, e_m]) + np.array(
             [along + across, along - across, -along + across, -along - across]
         )
-        points = apply_homography(CAMERA.ground_to_image(self.pose(drone, t_s)), outline)
+        if to_image is None:
+            to_image = CAMERA.ground_to_image(self.pose(drone, t_s))
+        points = apply_homography(to_image, outline)
         u_px, v_px = points.mean(axis=0)
         if not (0 <= u_px <= 640 and 0 <= v_px <= 480):
             return None
@@ -285,9 +289,11 @@ class FakeRun:
     def _identities(self, drone: int, t_s: float) -> podwatch.identities_t:
         agreed = t_s >= self.monitor_s[0] - 0.5
         boxes, ids = [], []
+        pose = self.pose(drone, t_s)
+        to_image = CAMERA.ground_to_image(pose)
         for animal in self.animal_ids:
-            box = self.box(drone, animal, t_s)
-            if box is not None and self.dive(animal, t_s) < 2 and self.pose(drone, t_s).height_m > 5:
+            box = self.box(drone, animal, t_s, to_image)
+            if box is not None and self.dive(animal, t_s) < 2 and pose.height_m > 5:
                 boxes.append(box)
                 ids.append(self.name(drone, animal, t_s) if agreed else -1)
         return make(
