@@ -71,38 +71,29 @@ class Scan:
         self._n_undefined = 0
         self._n_seen = 0
         self._n_promised: int | None = None  # by the summary
-        self._file = _open(path)
-        self.n_bytes = self._file.seek(0, 2)
-        try:
-            _check_magic(path, self._file, self.n_bytes)
-            self.closed = self._read_summary()
-        except BaseException:
-            self._file.close()
-            raise
-
-    def close(self) -> None:
-        self._file.close()
+        with _open(path) as file:
+            self.n_bytes = file.seek(0, 2)
+            _check_magic(path, file, self.n_bytes)
+            self.closed = self._read_summary(file)
 
     def messages(self) -> Iterator[RawMessage]:
-        """Every whole message; the file is closed at the end."""
-        try:
-            for record in self._records(len(MCAP0_MAGIC), self.n_bytes):
+        """Every whole message."""
+        with _open(self.path) as file:
+            for record in self._records(file, len(MCAP0_MAGIC), self.n_bytes):
                 yield from self._record_messages(record)
-            self._report_end()
-        finally:
-            self.close()
+        self._report_end()
 
-    def _read_summary(self) -> bool:
+    def _read_summary(self, file: BinaryIO) -> bool:
         """Take what a closed log says at its end: its number of messages, and each definition once more."""
         end = self.n_bytes - FOOTER_BYTES - len(MCAP0_MAGIC)
-        self._file.seek(max(end, 0))
-        tail = self._file.read()
+        file.seek(max(end, 0))
+        tail = file.read()
         if end < 0 or not tail.endswith(MCAP0_MAGIC) or tail[0] != Opcode.FOOTER:
             return False
         start = _parse(Footer.read, tail[RECORD_HEAD.size : FOOTER_BYTES]).summary_start
-        self._file.seek(start if start < end else end)
+        file.seek(start if start < end else end)
         try:
-            for opcode, body in _split(self._file.read(max(end - start, 0))):
+            for opcode, body in _split(file.read(max(end - start, 0))):
                 if opcode in DEFINITIONS:
                     self._define(opcode, body)
                 elif opcode == Opcode.STATISTICS:
@@ -111,7 +102,7 @@ class Scan:
             self._report(f"{self.path}: its summary at byte {start} is damaged; the messages do not need it")
         return True
 
-    def _records(self, offset: int, size: int) -> Iterator[_Record]:
+    def _records(self, file: BinaryIO, offset: int, size: int) -> Iterator[_Record]:
         """Records of the data section that matter, from `offset`; behind damage, from the next chunk.
 
         A record but a chunk has no checksum, so a damaged length is found out late, where no record
@@ -120,19 +111,19 @@ class Scan:
         searched_to = offset
         self._unread_from = size
         while offset < size:
-            self._file.seek(offset)
-            head = self._file.read(RECORD_HEAD.size)
+            file.seek(offset)
+            head = file.read(RECORD_HEAD.size)
             opcode, length = RECORD_HEAD.unpack(head) if len(head) == RECORD_HEAD.size else (0, 0)
             if opcode == Opcode.DATA_END and length == DATA_END_BYTES:
                 return
             if _is_opcode(opcode) and length <= size - offset - RECORD_HEAD.size:
                 if opcode in WANTED:
-                    yield _Record(offset, opcode, self._file.read(length))
+                    yield _Record(offset, opcode, file.read(length))
                 if opcode == Opcode.CHUNK:
                     searched_to = offset + 1
                 offset += RECORD_HEAD.size + length
                 continue
-            following = self._next_chunk(searched_to)
+            following = _next_chunk(file, searched_to)
             if following is None:
                 self._unread_from = offset
                 return
@@ -141,20 +132,6 @@ class Scan:
                 f"reading goes on with the chunk at byte {following}"
             )
             offset = following
-
-    def _next_chunk(self, offset: int) -> int | None:
-        """Where the first whole chunk at or behind `offset` begins, None where there is none."""
-        self._file.seek(offset)
-        rest = self._file.read()
-        found = rest.find(CHUNK_MARK)
-        while found >= 0:
-            start = found - CHUNK_MARK_OFFSET
-            if start >= 0:
-                opcode, length = RECORD_HEAD.unpack_from(rest, start)
-                if opcode == Opcode.CHUNK and length <= len(rest) - start - RECORD_HEAD.size:
-                    return offset + start
-            found = rest.find(CHUNK_MARK, found + 1)
-        return None
 
     def _record_messages(self, record: _Record) -> Iterator[RawMessage]:
         try:
@@ -247,6 +224,21 @@ def _check_magic(path: Path, file: BinaryIO, n_bytes: int) -> None:
             f"{path}: is cut off within its first {len(MCAP0_MAGIC)} bytes ({n_bytes} bytes); nothing is left"
         )
     raise LogError(f"{path}: is no MCAP file (begins with {magic!r}); give the path of a .mcap log")
+
+
+def _next_chunk(file: BinaryIO, offset: int) -> int | None:
+    """Where the first whole chunk at or behind `offset` begins, None where there is none."""
+    file.seek(offset)
+    rest = file.read()
+    found = rest.find(CHUNK_MARK)
+    while found >= 0:
+        start = found - CHUNK_MARK_OFFSET
+        if start >= 0:
+            opcode, length = RECORD_HEAD.unpack_from(rest, start)
+            if opcode == Opcode.CHUNK and length <= len(rest) - start - RECORD_HEAD.size:
+                return offset + start
+        found = rest.find(CHUNK_MARK, found + 1)
+    return None
 
 
 def _chunk_parts(body: bytes) -> list[tuple[int, bytes]]:

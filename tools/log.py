@@ -9,15 +9,18 @@ from typing import Annotated, Any
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from logs.exceptions import LogError, LogWarning
 from logs.reader import LogInfo, info, read, segments
+from logs.schemas import PACKAGE
 
 __all__ = ["app", "describe"]
 
 EXIT_BAD_INPUT = 2
 LONGEST_LIST = 8  # items of a list that `cat` prints; the rest is counted
+TABLE_COLUMNS = 100
 LONGEST_RAW = 16  # bytes of undecoded data that `cat` prints
 
 app = typer.Typer(help="Look into a drone's MCAP log.", no_args_is_help=True)
@@ -30,9 +33,9 @@ def show_info(path: LogPath) -> None:
     """Say what a log holds: its span, its channels, their rates and sizes, and whether it is whole."""
     with _clear_errors():
         log = info(path)
-    console = Console(soft_wrap=True)
-    console.print(_summary(log), markup=False, highlight=False)
-    console.print(_table(log))
+    sys.stdout.write(f"{_summary(log)}\n\n")
+    # Wide enough that no name is cut, in a pipe and in a narrow terminal too.
+    Console(file=sys.stdout, width=max(Console().width, TABLE_COLUMNS)).print(_table(log))
     for problem in log.problems:
         sys.stderr.write(f"warning: {problem}\n")
 
@@ -103,19 +106,19 @@ def _summary(log: LogInfo) -> str:
 
 
 def _table(log: LogInfo) -> Table:
-    table = Table()
+    table = Table(box=None, padding=(0, 2, 0, 0))
     for heading in ("channel", "type"):
         table.add_column(heading, no_wrap=True)
-    for heading in ("messages", "rate (Hz)", "size", "mean (bytes)", "lost"):
+    for heading in ("messages", "Hz", "size", "mean size", "lost"):
         table.add_column(heading, justify="right", no_wrap=True)
     for channel in log.channels:
         table.add_row(
-            channel.name,
-            channel.type_name or "not known",
+            escape(channel.name),
+            channel.type_name.removeprefix(f"{PACKAGE}.") or "not known",
             str(channel.n_messages),
             f"{channel.rate_hz:.2f}",
             _size(channel.n_bytes),
-            f"{channel.n_bytes / channel.n_messages:.0f}",
+            _size(round(channel.n_bytes / channel.n_messages)),
             "-" if channel.n_lost is None else str(channel.n_lost),
         )
     return table
@@ -125,7 +128,7 @@ def _size(n_bytes: int) -> str:
     for unit, scale in (("MB", 1e6), ("kB", 1e3)):
         if n_bytes >= scale:
             return f"{n_bytes / scale:.1f} {unit}"
-    return f"{n_bytes} bytes"
+    return f"{n_bytes} B"
 
 
 @contextmanager

@@ -273,6 +273,19 @@ def test_an_unknown_fingerprint_yields_raw_bytes_and_one_warning(tmp_path):
         list(read(path, strict=True))
 
 
+def test_no_schema_is_claimed_for_bytes_of_another_type(tmp_path):
+    other = bytes.fromhex("0123456789abcdef") + bytes(40)
+    path = log_of(tmp_path / "a.mcap", channels.TRACK, [make(podwatch.track_t).encode(), other])
+    with path.open("rb") as file:
+        found = [(schema and schema.name, dict(channel.metadata)) for schema, channel, _ in reader_of(file)]
+    assert found[0][0] == "podwatch.track_t"
+    assert found[1] == (None, {"drone": "1"})
+
+
+def reader_of(file):
+    return make_reader(file, validate_crcs=True).iter_messages()
+
+
 def test_a_channel_that_the_table_lacks_is_kept_raw_with_an_empty_schema(tmp_path):
     path = log_of(tmp_path / "a.mcap", "STRANGER", [b"", b"abc"])
     with pytest.warns(LogWarning, match="of no known type"):
@@ -302,6 +315,12 @@ def test_a_message_that_does_not_decode_is_raw_and_told_once(tmp_path):
     assert "TRACK at log time 0.000000 s does not decode as track_t" in text
     with pytest.raises(LogError, match="does not decode"):
         list(read(path, strict=True))
+
+
+def test_a_message_too_short_for_its_head_is_told_by_its_type(tmp_path):
+    stump = fingerprint(podwatch.track_t) + b"12"
+    with pytest.warns(LogWarning, match=r"does not decode as track_t \(.*, 10 bytes\)"):
+        assert [entry[2] for entry in read(log_of(tmp_path / "a.mcap", channels.TRACK, [stump]))] == [stump]
 
 
 @settings(deadline=None, max_examples=60)
