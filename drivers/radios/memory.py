@@ -47,9 +47,8 @@ class MemoryEther:
 
     def carry(self, sender: int, receiver: int, data: bytes) -> None:
         """Take one datagram; it arrives later, or never."""
-        is_lost = (
-            self._random.random() < self.loss
-        )  # drawn each time, so that a cut does not shift the later draws
+        # Drawn each time, so that a cut does not shift the later draws.
+        is_lost = self._random.random() < self.loss
         delay_s = self.latency_s + self.jitter_s * self._random.random()
         if not is_lost and not self.blocked(sender, receiver):
             self._deliver(delay_s, lambda: self._arrive(receiver, data))

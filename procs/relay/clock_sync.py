@@ -100,9 +100,8 @@ class FleetClock:
         self._offers[peer_id] = (offer, now_us)
 
     def update(self, living: Sequence[int], links: Mapping[int, LinkClock], now_us: int) -> None:
-        """Settle who the reference is and follow it. `living`: ids of the living drones, this one among
-        them."""
-        lowest = min(living)
+        """Settle who the reference is and follow it. `living`: ids of the living drones."""
+        lowest = min(living, default=NO_REFERENCE)
         if self.reference == self.own_id and lowest == self.own_id:
             self._fed_us = now_us
             return

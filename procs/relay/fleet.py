@@ -29,9 +29,8 @@ MAX_ORDERS = 6  # newest first; 13 bytes each
 ORDER = struct.Struct(">qBBBH")
 NO_ANIMAL = 255
 COUNTER_STEP_US = 100_000
-RESTART_US = (
-    1_000_000  # a row this much younger than ours comes from a clock that began anew, whatever its counter
-)
+# A row this much younger than ours comes from a clock that began anew, whatever its counter.
+RESTART_US = 1_000_000
 SAME_FIND_M = 1.0
 
 

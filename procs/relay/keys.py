@@ -26,7 +26,7 @@ def make_key(path: Path, force: bool = False) -> None:
     """
     if path.exists() and not force:
         raise FleetKeyError(
-            f"{path} exists: a new key would shut out every drone that holds the old one; force it, or use another path"
+            f"{path} exists: a new key shuts out every drone that holds the old; force it, or name another"
         )
     fresh = path.with_name(f".{path.name}.{secrets.token_hex(4)}")
     try:

@@ -71,14 +71,18 @@ class Link:
 
     def clock_part(self, offer: FleetOffer, now_us: int) -> ClockPart:
         """What to send so that the peer can measure its clock against ours."""
-        if self.heard_us is None or now_us - self.heard_us > self.limit_us:
+        if self.heard_us is None or not self.is_heard(now_us):
             return ClockPart(0, None, offer)
         return ClockPart(self.peer_stamp_us, now_us - self.heard_us, offer)
 
+    def is_heard(self, now_us: int) -> bool:
+        """Whether the peer was heard within the limit."""
+        return self.heard_us is not None and now_us - self.heard_us <= self.limit_us
+
     def is_up(self, now_us: int) -> bool:
         """Whether both ends have heard each other within the limit."""
-        both = (self.heard_us, self.heard_by_peer_us)
-        return all(when is not None and now_us - when <= self.limit_us for when in both)
+        by_peer_us = self.heard_by_peer_us
+        return self.is_heard(now_us) and by_peer_us is not None and now_us - by_peer_us <= self.limit_us
 
     def count_sent(self, kind: str, payload: int, encoded: int, size: int) -> None:
         """A datagram has gone out to the radio."""

@@ -18,9 +18,8 @@ BOAT_ID = 0  # roster member 0: heard and counted, never a neighbour on the ring
 AGE_STEP_US = 50_000
 UNKNOWN_AGE = 255  # 12.75 s or more, or never heard
 HOP_US = 250_000  # the longest that a relay keeps its table before it passes it on
-NEWER_US = (
-    2 * AGE_STEP_US
-)  # evidence of life is newer only by more than what rounding and clock errors may pretend
+# Evidence of life is newer only by more than what rounding and clock errors may pretend.
+NEWER_US = 2 * AGE_STEP_US
 
 
 @dataclass(frozen=True)
@@ -40,17 +39,20 @@ class Members:
     """One drone's knowledge of who lives. All times in us of its own clock."""
 
     def __init__(self, own_id: int, roster: tuple[int, ...], lost_after_s: float, now_us: int) -> None:
-        """`roster`: drone ids in ring order. Everybody is taken to live for the first `lost_after_s`, so
-        that a relay that restarts in flight stands at its place in the ring at once."""
+        """`roster`: drone ids in ring order. Everybody is taken to live at first, until word of them could
+        have come round and `lost_after_s` more, so that a relay that restarts in flight stands at its
+        place in the ring at once. Raises ValueError for a roster that does not hold `own_id`, or holds the
+        boat.
+        """
+        if own_id not in (BOAT_ID, *roster) or BOAT_ID in roster:
+            raise ValueError(f"roster {roster}: it must hold drone {own_id}, and never the boat")
         self.own_id = own_id
         self.roster = roster
-        self.ids = (
-            BOAT_ID,
-            *(drone_id for drone_id in roster if drone_id != BOAT_ID),
-        )  # order of the age table
+        self.ids = (BOAT_ID, *roster)  # order of the age table
         self._lost_after_us = round(lost_after_s * 1e6)
         self._heard_us: dict[int, int] = {}  # newest evidence of each member
-        self._refreshed_us = dict.fromkeys(roster, now_us)  # when that evidence last got newer
+        # When that evidence last got newer. At first, word of a far member takes a while to come round.
+        self._refreshed_us = dict.fromkeys(roster, now_us + len(roster) // 2 * HOP_US)
         self._marked_us: dict[int, int] = {}  # the evidence of that moment
 
     def hear(self, member: int, sent_us: int, now_us: int) -> None:

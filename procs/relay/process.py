@@ -21,6 +21,7 @@ from lcmtypes import channels
 from lcmtypes.podwatch import mission_state_t, vehicle_state_t
 from procs.relay.keys import FleetKeyError, read_key
 from procs.relay.relay import TICK_S, Relay
+from procs.relay.seal import Refusal
 from procs.runtime import Runtime, RuntimeFailure
 
 __all__ = ["RelayShell", "key_path", "setup"]
@@ -44,7 +45,7 @@ class RelayShell:
         self._core = core
         self._mission: mission_state_t | None = None
         self._vehicle: vehicle_state_t | None = None
-        self._refused: dict[str, int] = {}
+        self._refused: dict[Refusal, int] = {}
 
     def mission_said(self, message: mission_state_t) -> None:
         """Keep the navigator's last word for this drone's row."""
@@ -98,7 +99,7 @@ class RelayShell:
         self._refused = refused
         self._tell(
             "refused",
-            ", ".join(f"{n} {reason}" for reason, n in sorted(news.items()) if n),
+            ", ".join(f"{n} {reason.value}" for reason, n in news.items() if n),
             "refused datagrams",
         )
         self._tell(

@@ -31,13 +31,6 @@ TICKS_PER_HELLO = 4
 HELLOS = 4  # lost members called at each such tick, in turn
 ENCODED_LIMIT_BYTES = 400  # of one message; with header and seal it stays within 500
 ROW_BYTES = 22
-MALFORMED, LATE, NOT_NEIGHBOUR, BAD_MESSAGE, STALE = (
-    "malformed",
-    "late",
-    "not a neighbour",
-    "bad message",
-    "stale",
-)
 
 Send = Callable[[int, bytes], bool]
 
@@ -79,7 +72,7 @@ class Relay:
         self.sessions = Sessions(fleet_key, own_id, session, self.members.ids)
         self.fleet = FleetTable(own_id, self.members.ids)
         self.fleet_clock = FleetClock(own_id, len(roster), now_us)
-        self.refused: dict[str, int] = {}  # arrivals that were not believed, by reason, since start
+        self.refused: dict[Refusal, int] = {}  # arrivals that were not believed, by reason, since start
         self._send_to_radio = send
         reserved = self._own_bytes_per_s(bytes_per_s)
         self.links = {
@@ -142,9 +135,9 @@ class Relay:
         for peer_id in self._spoken_to(now_us):
             self._send_own(self.links[peer_id], has_table, now_us)
         if self._n_ticks % TICKS_PER_HELLO == 0:
-            lost = [peer_id for peer_id in self.members.lost(now_us) if peer_id in self.links]
-            for k in range(min(HELLOS, len(lost))):
-                self._send_own(self.links[lost[(self._hello_turn + k) % len(lost)]], False, now_us)
+            called = self._called(now_us)
+            for k in range(min(HELLOS, len(called))):
+                self._send_own(self.links[called[(self._hello_turn + k) % len(called)]], False, now_us)
             self._hello_turn += HELLOS
         self._n_ticks += 1
 
@@ -154,22 +147,22 @@ class Relay:
         try:
             opened = self.sessions.open(data)
         except RefusedError as refused:
-            self._refuse(refused.reason.value, refused.sender)
+            self._refuse(refused.reason, refused.sender)
             return None
         link = self.links.get(opened.sender)
         if link is None:
-            self._refuse(Refusal.STRANGER.value, None)
+            self._refuse(Refusal.STRANGER, None)
             return None
         if opened.is_new_session:
             link.restart()
         try:
             body = datagram.unpack(opened.body, len(self.members.ids))
             if link.is_late(body.stamp_us, now_us):
-                self._refuse(LATE, link.peer_id)
+                self._refuse(Refusal.LATE, link.peer_id)
                 return None
             self._hear(link, body, now_us)
         except ValueError:
-            self._refuse(MALFORMED, link.peer_id)
+            self._refuse(Refusal.MALFORMED, link.peer_id)
             return None
         if body.message is None:
             return None
@@ -222,12 +215,20 @@ class Relay:
         return min(bytes_per_s // 2, ticks_per_s * link_bytes + tables_per_s * table_bytes)
 
     def _spoken_to(self, now_us: int) -> tuple[int, ...]:
-        """The living neighbours, and the boat while it speaks to us."""
+        """The living neighbours, and the boat while it is heard; from the boat, the one drone that it
+        hears."""
         boat = self.links.get(BOAT_ID)
-        hears_boat = (
-            boat is not None and boat.heard_us is not None and now_us - boat.heard_us <= boat.limit_us
-        )
+        if self.own_id == BOAT_ID:
+            heard = [link for link in self.links.values() if link.is_up(now_us)]
+            return tuple(link.peer_id for link in heard[:1])
+        hears_boat = boat is not None and boat.is_heard(now_us)
         return (*self.members.neighbours(now_us).ids, *((BOAT_ID,) if hears_boat else ()))
+
+    def _called(self, now_us: int) -> list[int]:
+        """Whom to call until they answer: the lost; from a boat that hears nobody, everybody."""
+        if self.own_id == BOAT_ID:
+            return [] if self._spoken_to(now_us) else list(self.links)
+        return [peer_id for peer_id in self.members.lost(now_us) if peer_id in self.links]
 
     def _send_own(self, link: Link, has_table: bool, now_us: int) -> None:
         clock = link.clock_part(self.fleet_clock.offer(now_us), now_us)
@@ -273,21 +274,21 @@ class Relay:
         """A neighbour's message, if its channel may cross, it decodes as that channel's type and it is
         fresh."""
         if link.peer_id not in self.members.neighbours(now_us).ids:
-            self._refuse(NOT_NEIGHBOUR, link.peer_id)
+            self._refuse(Refusal.NOT_NEIGHBOUR, link.peer_id)
             return None
         channel = channels.CROSSING[part.channel] if part.channel < len(channels.CROSSING) else None
         message = _decode(channel, part.data) if channel else None
         if channel is None or message is None or message.drone_id != link.peer_id:
-            self._refuse(BAD_MESSAGE, link.peer_id)
+            self._refuse(Refusal.BAD_MESSAGE, link.peer_id)
             return None
         offset_us = link.clock.offset_us(now_us)
         age_us = 0 if offset_us is None else now_us - (message.utime - offset_us)
         if abs(age_us) > channel.max_age_s * 1e6:
-            self._refuse(STALE, link.peer_id)
+            self._refuse(Refusal.STALE, link.peer_id)
             return None
         return Copy(link.peer_id, channel, part.data)
 
-    def _refuse(self, reason: str, sender: int | None) -> None:
+    def _refuse(self, reason: Refusal, sender: int | None) -> None:
         self.refused[reason] = self.refused.get(reason, 0) + 1
         if sender in self.links:
             self.links[sender].n_rejected += 1

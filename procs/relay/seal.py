@@ -35,19 +35,23 @@ PROOF_BYTES = 8  # of a challenge and of its echo
 HAS_CHALLENGE, HAS_ECHO = 1, 2
 OVERHEAD_BYTES = HEADER.size + 1 + TAG_BYTES  # of a datagram between proven sessions
 WINDOW_BITS = 64
-MAX_CANDIDATES = (
-    4  # unproven sessions remembered for each peer; more would let recorded datagrams use up memory
-)
+# Unproven sessions remembered for each peer; without a limit recorded datagrams could use up the memory.
+MAX_CANDIDATES = 4
 MAX_CHALLENGES = 40  # sent to one candidate before it is forgotten: 10 s at 4 Hz
 
 
 class Refusal(Enum):
-    """Why a datagram was refused."""
+    """Why a datagram, or the message in it, was refused: the first four here, the rest by the relay."""
 
     STRANGER = "stranger"  # not of this fleet: another version, sender or key
     ALTERED = "altered"  # of a known session, but the tag does not fit
     REPLAYED = "replayed"  # its counter was seen, or is older than the window
     UNPROVEN = "unproven"  # sealed with the fleet key, but its sender has not echoed our challenge
+    MALFORMED = "malformed"  # believed, but laid out otherwise: a relay of another version, or another roster
+    LATE = "late"  # under way for so long that somebody held it back
+    NOT_NEIGHBOUR = "not a neighbour"  # a message from a drone that is not beside this one on the ring
+    BAD_MESSAGE = "bad message"  # its channel may not cross, or it is not what its channel carries
+    STALE = "stale"  # a message older than its channel allows
 
 
 class RefusedError(Exception):
