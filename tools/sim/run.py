@@ -8,9 +8,10 @@ from pathlib import Path
 from procs.relay.keys import make_key
 from tools.sim.lockstep import LockstepFleet
 from tools.sim.plan import RunPlan
+from tools.sim.processes import ProcessFleet
 from tools.sim.watch import Screen, Watch
 
-__all__ = ["finish", "fly_lockstep", "new_folder", "write_truth_notes"]
+__all__ = ["finish", "fly_lockstep", "fly_processes", "new_folder", "write_truth_notes"]
 
 STEP_S = 0.25
 
@@ -45,6 +46,22 @@ def fly_lockstep(plan: RunPlan, screen: Screen | None, fallback_reason: str = ""
     finally:
         fleet.close()
     write_truth_notes(plan, watch, "lockstep", fallback_reason, fleet.now_s, time.monotonic() - began)
+
+
+def fly_processes(plan: RunPlan, screen: Screen | None) -> None:
+    """Fly a plan as operating-system processes and write its notes. Raises SupervisorError."""
+    make_key(plan.folder / plan.mission.radio.key_file)
+    watch = Watch(plan.mission, screen)
+    with ProcessFleet(plan, watch) as fleet:
+        fleet.wait_until_ready()
+        began = time.monotonic()
+        over = False
+        while not over:
+            fleet.look()
+            wall_s = time.monotonic() - began
+            over = watch.step(fleet.now_s, fleet, fleet.now_s / max(wall_s, 1e-6))
+        flown_s, wall_s = fleet.now_s, time.monotonic() - began
+    write_truth_notes(plan, watch, "processes", "", flown_s, wall_s)
 
 
 def write_truth_notes(

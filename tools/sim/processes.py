@@ -1,0 +1,199 @@
+"""A fleet as operating-system processes under supervisord: real multicast buses, real MAVLink over UDP, real radios on loopback."""
+
+import json
+import secrets
+import select
+import time
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import lcm
+
+from drivers.sim.clock import ClockPage
+from drivers.sim.remote import world_url
+from lcmtypes import channels
+from lcmtypes.podwatch import heartbeat_t
+from procs import processes
+from procs.settings import DriverSpec, DroneSettings
+from tools.sim.buses import Slot, bus_url, free_udp_ports
+from tools.sim.plan import RunPlan
+from tools.sim.supervision import Supervisor, program
+from tools.sim.watch import Watch
+from tools.sim.world_process import COMMAND_CHANNEL
+
+__all__ = ["ProcessFleet"]
+
+START_LIMIT_S = 90.0
+CHECK_EVERY_S = 2.0
+LOOK_S = 0.1
+SHARED_FOLDER = Path("/dev/shm")
+
+
+class ProcessFleet:
+    """All processes of a plan; use as a context manager. `watch` hears every bus."""
+
+    def __init__(self, plan: RunPlan, watch: Watch) -> None:
+        self.plan = plan
+        self._watch = watch
+        self._run = secrets.token_hex(4)
+        self._slot = Slot()
+        roster = plan.mission.roster
+        ports = free_udp_ports(3 * len(roster))
+        self._mavlink_ports = dict(zip(roster, ports, strict=False))
+        self._radio_ports = dict(zip(roster, ports[len(roster) :], strict=False))
+        self._ether_ports = dict(zip(roster, ports[2 * len(roster) :], strict=False))
+        self._page_path = SHARED_FOLDER / f"podwatch_{self._run}_clock"
+        self._page = ClockPage(self._page_path, create=True)
+        self._page.set(0.0, 0.0)
+        self._heard: set[str] = set()
+        self._world = lcm.LCM(world_url(self._slot.number))
+        self._buses = [self._listen(drone_id) for drone_id in roster]
+        self._write_settings()
+        self.supervisor = Supervisor(plan.folder, roster)
+        self._next_check = 0.0
+
+    def __enter__(self) -> "ProcessFleet":
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        self.close()
+
+    @property
+    def now_s(self) -> float:
+        """Simulation time, s."""
+        return self._page.read()[0] / 1e6
+
+    def wait_until_ready(self) -> None:
+        """Until every process has beaten once; then the simulation clock begins. Raises SupervisorError."""
+        wanted = {program(d, p.name) for d in self.plan.mission.roster for p in processes.PROCESSES}
+        limit = time.monotonic() + START_LIMIT_S
+        while not wanted <= self._heard and time.monotonic() < limit:
+            self.look()
+        self._command(kind="go")
+
+    def look(self) -> None:
+        """Hear what waits on the buses; now and then see whether the tree still stands."""
+        ready, _, _ = select.select(self._buses, [], [], LOOK_S)
+        for bus in ready:
+            while bus.handle_timeout(0) > 0:
+                pass
+        if time.monotonic() >= self._next_check:
+            self._next_check = time.monotonic() + CHECK_EVERY_S
+            self.supervisor.check()
+
+    def close(self) -> None:
+        """Stop all in order; leave nothing in shared memory."""
+        self.supervisor.stop()
+        for leftover in SHARED_FOLDER.glob(f"podwatch_{self._run}_*"):
+            leftover.unlink(missing_ok=True)
+        self._slot.close()
+
+    def dive(self, on: bool) -> None:
+        self._command(kind="dive", on=on)
+
+    def cut(self, first: int, second: int, on: bool) -> None:
+        self._command(kind="cut", between=[first, second], on=on)
+
+    def kill(self, drone_id: int) -> None:
+        """The whole drone, vehicle and processes."""
+        self._command(kind="kill", drone=drone_id)
+        names = {program(drone_id, process.name) for process in processes.PROCESSES}
+        pids = [pid for name, (_, pid) in self.supervisor.states().items() if name in names]
+        self.supervisor.drop_drone(drone_id, pids)
+
+    def _listen(self, drone_id: int) -> Any:
+        bus = lcm.LCM(bus_url(drone_id, self._slot.number))
+        handle = bus.subscribe(".*", partial(self._hear, drone_id))
+        handle.set_queue_capacity(2000)
+        return bus
+
+    def _hear(self, drone_id: int, channel: str, data: bytes) -> None:
+        if channel == channels.HEARTBEAT and len(self._heard) < 1000:
+            self._heard.add(program(drone_id, heartbeat_t.decode(data).process))
+        self._watch.hear(drone_id, channel, data)
+
+    def _command(self, **command: Any) -> None:
+        self._world.publish(COMMAND_CHANNEL, json.dumps(command).encode())
+
+    def _write_settings(self) -> None:
+        output = self.plan.folder / "output"
+        output.mkdir(exist_ok=True)
+        (output / "world.json").write_text(json.dumps(self._world_settings()))
+        for drone_id in self.plan.mission.roster:
+            path = output / f"drone_{drone_id}.json"
+            path.write_text(self._drone_settings(drone_id).model_dump_json(indent=1))
+
+    def _world_settings(self) -> dict[str, Any]:
+        plan = self.plan
+        return {
+            "mission": plan.mission.model_dump(mode="json"),
+            "folder": str(plan.folder),
+            "sensor": plan.sensor,
+            "scene": str(plan.scene) if plan.scene else "",
+            "slot": self._slot.number,
+            "clock_page": str(self._page_path),
+            "mavlink_ports": self._mavlink_ports,
+            "radio_ports": self._radio_ports,
+            "ether_ports": self._ether_ports,
+        }
+
+    def _drone_settings(self, drone_id: int) -> DroneSettings:
+        mission = self.plan.mission
+        camera = mission.camera
+        clock = self.plan.clock(drone_id)
+        seed = mission.seed * 100 + drone_id
+        boxes = self.plan.sensor == "boxes"
+        specs: dict[str, tuple[str, dict[str, Any]]] = {
+            "clock": (
+                "drivers.sim.clock:SimClock",
+                {
+                    "page": str(self._page_path),
+                    "offset_us": clock.offset_us,
+                    "drift_ppm": clock.drift_ppm,
+                },
+            ),
+            "camera": (
+                "drivers.sim.remote:RemoteCamera",
+                {
+                    "drone_id": drone_id,
+                    "world_url": world_url(self._slot.number),
+                    "clock_page": str(self._page_path),
+                    "image_size": [camera.width_px, camera.height_px],
+                    "vfov_deg": camera.vfov_deg,
+                    "surface": self.plan.surface_options(),
+                    "poster": mission.pod.poster,
+                },
+            ),
+            "frames": ("drivers.frames:SharedFrames", {"run": self._run, "drone_id": drone_id}),
+            "detector": ("drivers.sim.boxes:BoxDetector", {"seed": seed})
+            if boxes
+            else ("procs.detector.yolo:Detector", {}),
+            "tracker": ("drivers.sim.boxes:BoxTracker", {"seed": seed})
+            if boxes
+            else ("procs.tracker.mask_tracker:MaskTracker", {}),
+            "autopilot": (
+                "drivers.autopilots.mavlink_link:MavlinkUdp",
+                {"listen": f"127.0.0.1:{self._mavlink_ports[drone_id]}", "system_id": drone_id},
+            ),
+            "radio": (
+                "drivers.radios.udp:UdpRadio",
+                {
+                    "bind": f"127.0.0.1:{self._radio_ports[drone_id]}",
+                    "peers": {
+                        str(peer): f"127.0.0.1:{self._ether_ports[peer]}"
+                        for peer in mission.roster
+                        if peer != drone_id
+                    },
+                },
+            ),
+        }
+        return DroneSettings(
+            drone_id=drone_id,
+            mission=mission,
+            seed=mission.seed,
+            bus_url=bus_url(drone_id, self._slot.number),
+            run_dir=str(self.plan.folder),
+            log_path=str(self.plan.log_path(drone_id)),
+            drivers={name: DriverSpec(driver=driver, options=options) for name, (driver, options) in specs.items()},
+        )

@@ -1,0 +1,153 @@
+"""supervisord for a simulated fleet: its configuration from the process table, and talking to it."""
+
+import configparser
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+from xmlrpc.client import Fault, ServerProxy
+
+from procs import processes
+from procs.main import EXIT_CANNOT_START
+from procs.processes import Restart
+
+__all__ = ["Supervisor", "SupervisorError", "configuration", "program"]
+
+STOP_WAIT_S = 6
+START_TRIES = 5
+ONE_THREAD = "OMP_NUM_THREADS=1,OPENBLAS_NUM_THREADS=1,MKL_NUM_THREADS=1"
+
+
+class SupervisorError(Exception):
+    """The process tree cannot start or has fallen; the message says which process, why, and where its output is."""
+
+
+def program(drone_id: int, process: str) -> str:
+    """supervisord's name of one process of one drone."""
+    return f"{process}_{drone_id}"
+
+
+def configuration(folder: Path, socket: Path, roster: tuple[int, ...]) -> configparser.RawConfigParser:
+    """The whole tree: the world, and a group a drone with a program for each row of the process table."""
+    config = configparser.RawConfigParser()
+    config["unix_http_server"] = {"file": str(socket), "chmod": "0700"}
+    config["supervisord"] = {
+        "nodaemon": "true",
+        "logfile": str(folder / "output" / "supervisord.log"),
+        "pidfile": str(folder / "output" / "supervisord.pid"),
+        "childlogdir": str(folder / "output"),
+        "environment": ONE_THREAD,
+    }
+    factory = "supervisor.rpcinterface:make_main_rpcinterface"
+    config["rpcinterface:supervisor"] = {"supervisor.rpcinterface_factory": factory}
+    config["supervisorctl"] = {"serverurl": f"unix://{socket}"}
+    config["program:world"] = {
+        "command": f"{sys.executable} -m tools.sim.world_process {folder / 'output' / 'world.json'}",
+        "priority": "1",
+        **_common(folder, "world"),
+        "autorestart": "false",
+    }
+    for drone_id in roster:
+        names = []
+        for process in processes.PROCESSES:
+            name = program(drone_id, process.name)
+            names.append(name)
+            settings = folder / "output" / f"drone_{drone_id}.json"
+            config[f"program:{name}"] = {
+                "command": f"{sys.executable} -m procs.main {process.name} {settings} --end-with-parent",
+                "priority": str(1000 - 100 * process.stop_order),
+                **_common(folder, name),
+                "autorestart": "unexpected" if process.restart_ground is Restart.ALWAYS else "false",
+            }
+        config[f"group:drone_{drone_id}"] = {"programs": ",".join(names)}
+    return config
+
+
+def _common(folder: Path, name: str) -> dict[str, str]:
+    return {
+        "directory": str(folder),
+        "startsecs": "1",
+        "startretries": str(START_TRIES),
+        "exitcodes": str(EXIT_CANNOT_START),
+        "stopsignal": "TERM",
+        "stopwaitsecs": str(STOP_WAIT_S),
+        "redirect_stderr": "true",
+        "stdout_logfile": str(folder / "output" / f"{name}.txt"),
+        "stdout_logfile_maxbytes": "1MB",
+    }
+
+
+class Supervisor:
+    """One supervisord with its tree; ends with the process that made it."""
+
+    def __init__(self, folder: Path, roster: tuple[int, ...]) -> None:
+        self._output = folder / "output"
+        self._output.mkdir(exist_ok=True)
+        # A socket's path holds at most 107 bytes, and a run's folder may be deep.
+        self._socket_folder = tempfile.TemporaryDirectory(prefix="podwatch-")
+        socket = Path(self._socket_folder.name) / "supervisor.sock"
+        path = self._output / "supervisord.conf"
+        with path.open("w") as file:
+            configuration(folder, socket, roster).write(file)
+        self._popen = subprocess.Popen(
+            [sys.executable, "-m", "tools.sim.supervised", str(path)],
+            stdout=subprocess.DEVNULL,
+            stderr=(self._output / "supervisord.err").open("w"),
+            stdin=subprocess.DEVNULL,
+            start_new_session=True,  # a Ctrl-C is for the tool, which then stops the tree in order
+        )
+        self._proxy = _proxy(socket)
+
+    @property
+    def pid(self) -> int:
+        """supervisord's own process id."""
+        return self._popen.pid
+
+    @property
+    def is_alive(self) -> bool:
+        return self._popen.poll() is None
+
+    def states(self) -> dict[str, tuple[str, int]]:
+        """Program -> (supervisord's word for its state, pid); empty while supervisord does not answer yet."""
+        try:
+            rows: Any = self._proxy.supervisor.getAllProcessInfo()
+        except (OSError, Fault):
+            return {}
+        return {row["name"]: (row["statename"], row["pid"]) for row in rows}
+
+    def check(self) -> None:
+        """Raise SupervisorError where supervisord has died, or a process cannot start."""
+        if not self.is_alive:
+            raise SupervisorError(f"supervisord ended with code {self._popen.returncode}; see {self._output}")
+        for name, (state, _) in self.states().items():
+            if state in ("FATAL", "EXITED"):
+                output = (self._output / f"{name}.txt").read_text(errors="replace").strip()
+                last = output.splitlines()[-1] if output else "it said nothing"
+                raise SupervisorError(f"{name} cannot run: {last} (all it said: {self._output / name}.txt)")
+
+    def drop_drone(self, drone_id: int, pids: list[int]) -> None:
+        """End a whole drone at once: freeze its processes, so that it says nothing more, then have them removed."""
+        for pid in pids:
+            if pid:
+                os.kill(pid, signal.SIGSTOP)
+        self._proxy.supervisor.stopProcessGroup(f"drone_{drone_id}", False)
+
+    def stop(self) -> None:
+        """Stop the tree in its order and wait for it."""
+        if self.is_alive:
+            self._popen.terminate()
+            try:
+                self._popen.wait(timeout=STOP_WAIT_S * 5)
+            except subprocess.TimeoutExpired:
+                self._popen.kill()
+                self._popen.wait()
+        self._socket_folder.cleanup()
+
+
+def _proxy(socket: Path) -> Any:
+    from supervisor.xmlrpc import SupervisorTransport  # noqa: PLC0415 - slow to import
+
+    return ServerProxy("http://127.0.0.1", transport=SupervisorTransport(None, None, f"unix://{socket}"))
