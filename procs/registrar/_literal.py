@@ -49,7 +49,9 @@ def literal_alignment(source: Array, target: Array) -> tuple[Array, NDArray[np.i
     transform = np.eye(3)
     corners, goals = corners_of(source), corners_of(target)
     previous = None
-    for iteration in range(1, MAX_ITERATIONS + 1):
+    iterations = 0
+    while iterations < MAX_ITERATIONS:
+        iterations += 1
         costs, best = corner_costs(corners, goals)
         rows, columns = linear_sum_assignment(costs)
         points = corners[rows].reshape(-1, 2)
@@ -66,4 +68,4 @@ def literal_alignment(source: Array, target: Array) -> tuple[Array, NDArray[np.i
         if state == previous and np.allclose(step, np.eye(3), atol=1e-6):
             break
         previous = state
-    return transform, np.column_stack([rows, columns]), costs[rows, columns], iteration
+    return transform, np.column_stack([rows, columns]), costs[rows, columns], iterations

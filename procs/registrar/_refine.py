@@ -18,7 +18,7 @@ Ints = NDArray[np.intp]
 # Body sizes. An animal's own motion between two frames and the box's jitter both count; the widest is a pod
 # that moved.
 SIGMAS = (0.8, 0.4, 0.2, 0.1, 0.06)
-SIGMA_PRICES = (4.0, 2.0, 1.0, 0.0, 0.0)  # nats: most views of one instant agree within a tenth of a body
+SIGMA_PRICES = (12.0, 8.0, 3.0, 0.0, 0.0)  # nats: most views of one instant agree within a tenth of a body
 FITS_PER_SIGMA = 2
 SHEAR_STD = 0.07  # of what two tilted cameras shear, as a share of the scale
 PERSPECTIVE_STD = 0.16  # of the perspective terms of two tilted cameras, over the width of a view
@@ -138,6 +138,8 @@ def refine(pair: Pair, homographies: Array) -> list[Candidate]:
         )
         scores = kept.sum(axis=1) + alone + evidence + pair.transform_prior(homographies) - price
         for index in range(len(homographies)):
+            if not (columns[index] >= 0).any():
+                continue  # two views of one scene share an animal, or there is nothing to find
             key = tuple(columns[index].tolist())
             if key not in best or scores[index] > best[key].score:
                 best[key] = Candidate(

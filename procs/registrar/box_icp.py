@@ -91,7 +91,7 @@ def _heading_prior(heading_prior_rad: float | Sequence[float] | None) -> Prior:
         or (len(values) == 2 and values[1] <= 0)
     ):
         raise ValueError(
-            f"heading_prior_rad is {heading_prior_rad!r}: give radians, or (radians, standard deviation above 0), or None"
+            f"heading_prior_rad is {heading_prior_rad!r}: give radians, or (radians, std above 0), or None"
         )
     # A camera that turns clockwise sees the scene turn the other way; in px (v down) clockwise is positive.
     return Prior(
@@ -111,11 +111,11 @@ def align_marks(source: Marks, target: Marks, *, prior: Prior | None = None) -> 
         return _transposed(align_marks(target, source, prior=_reversed(prior, source)), source, target)
     pair = Pair(source, target, prior)
     candidates = refine(pair, find_similarities(pair))
+    if not candidates:
+        return _unmatched(len(source), len(target))
     best = candidates[0]
     rows = np.flatnonzero(best.columns >= 0)
     matches = np.column_stack([rows, best.columns[rows]])
-    if not len(rows):
-        return _unmatched(len(source), len(target))
     transform = pair.denormalised(best.homography)
     confidence, is_ambiguous = _judge(candidates)
     return _alignment(source, target, transform, matches, confidence, is_ambiguous, ITERATIONS)

@@ -5,7 +5,7 @@ A packet is a header of 16 bytes and 9 bytes an animal (paper, Communication Ban
 big endian:
 
     header  version B, episode H, proposer B, lap B, rank B, flags B, confidence B (in 255ths), origin north
-            and east h (dm of the fleet's frame), yaw of the first view B (256ths of a turn), animals B,
+            and east h (m of the fleet's frame), yaw of the first view B (256ths of a turn), animals B,
             checksum H
     animal  north and east h (cm from the origin), axis state 2 bits and size 14 bits (cm), axis B (256ths
             of half a turn), hits and misses 4 bits each, id B (255: none)
@@ -17,6 +17,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 __all__ = [
     "ANIMAL_BYTES",
@@ -90,6 +91,11 @@ class MapHeader:
     origin_e_m: float
     yaw_rad: float
 
+    @property
+    def origin(self) -> NDArray[np.float64]:
+        """(2,) metres north and east of the fleet's origin."""
+        return np.array([self.origin_n_m, self.origin_e_m])
+
 
 def encode_map(header: MapHeader, animals: Sequence[MapAnimal]) -> bytes:
     """The packet of a map. Raises ValueError for what does not fit, naming it."""
@@ -97,12 +103,12 @@ def encode_map(header: MapHeader, animals: Sequence[MapAnimal]) -> bytes:
         raise ValueError(
             f"{len(animals)} animals: a map packet holds {MAX_ANIMALS}; leave the least seen out"
         )
-    origin = (round(header.origin_n_m * 10), round(header.origin_e_m * 10))
+    origin = (round(header.origin_n_m), round(header.origin_e_m))
     if max(abs(value) for value in origin) > 32767:
         raise ValueError(
-            f"map origin {origin} dm: must be within 3276 m of the fleet's origin; move the fleet's origin"
+            f"map origin {origin} m: must be within 32767 m of the fleet's origin; move the fleet's origin"
         )
-    body = b"".join(_encode_animal(one, origin[0] / 10, origin[1] / 10) for one in animals)
+    body = b"".join(_encode_animal(one, *origin) for one in animals)
     values = (
         *(VERSION, header.episode & 0xFFFF, header.proposer, header.lap, header.rank, header.flags),
         *(round(np.clip(header.confidence, 0, 1) * 255), *origin),
@@ -123,32 +129,34 @@ def decode_map(packet: bytes) -> tuple[MapHeader, list[MapAnimal]]:
         raise PacketError(
             f"map packet of version {version}: this drone reads {VERSION}; update the older one"
         )
-    if len(packet) != HEADER_BYTES + count * ANIMAL_BYTES:
+    wanted = HEADER_BYTES + count * ANIMAL_BYTES
+    if len(packet) != wanted:
         raise PacketError(
-            f"map packet of {len(packet)} bytes says {count} animals, {HEADER_BYTES + count * ANIMAL_BYTES} bytes"
+            f"map packet of {len(packet)} bytes: the {count} animals that it announces take {wanted}"
         )
     body = packet[HEADER_BYTES:]
     if binascii.crc_hqx(packet[: HEADER_BYTES - 2] + body, 0xFFFF) != checksum:
         raise PacketError(f"map packet with checksum {checksum:#06x} was altered on its way")
     header = MapHeader(
-        *(episode, proposer, lap, rank, flags, confidence / 255, north / 10, east / 10, yaw / 256 * 2 * np.pi)
+        *(episode, proposer, lap, rank, flags, confidence / 255, north, east, yaw / 256 * 2 * np.pi)
     )
     chunks = (body[start : start + ANIMAL_BYTES] for start in range(0, len(body), ANIMAL_BYTES))
-    return header, [_decode_animal(chunk, north / 10, east / 10) for chunk in chunks]
+    return header, [_decode_animal(chunk, north, east) for chunk in chunks]
 
 
 def _encode_animal(animal: MapAnimal, origin_n_m: float, origin_e_m: float) -> bytes:
     north, east = animal.n_m - origin_n_m, animal.e_m - origin_e_m
     if not (abs(north) <= REACH_M and abs(east) <= REACH_M and 0 <= animal.size_m <= MAX_SIZE_M):
         raise ValueError(
-            f"animal {animal.id} at ({north:.1f}, {east:.1f}) m from the map's origin, size {animal.size_m:.1f} m: must be "
-            f"within {REACH_M} m and no longer than {MAX_SIZE_M} m; leave it out of the map"
+            f"animal {animal.id} at ({north:.1f}, {east:.1f}) m from the map's origin, size {animal.size_m:.1f} m: "
+            f"must be within {REACH_M} m and no longer than {MAX_SIZE_M} m; leave it out of the map"
         )
     if not (
         0 <= animal.id <= NO_ID and 0 <= animal.hits <= COUNTER_LIMIT and 0 <= animal.misses <= COUNTER_LIMIT
     ):
         raise ValueError(
-            f"animal id {animal.id}, hits {animal.hits}, misses {animal.misses}: ids are 0 to {NO_ID}, counters 0 to 15"
+            f"animal id {animal.id}, hits {animal.hits}, misses {animal.misses}: ids are 0 to {NO_ID}, "
+            "counters 0 to 15"
         )
     return ANIMAL.pack(
         *(round(north * 100), round(east * 100), animal.axis_state << 14 | round(animal.size_m * 100)),
@@ -199,5 +207,14 @@ class Memory:
         return kept.known_at(now_s)
 
     def forgotten_counts(self) -> tuple[MapAnimal, ...]:
-        """The animals with no view counted yet, as a new episode starts from them."""
-        return tuple(replace(one, hits=0, misses=0) for one in self.animals)
+        """The animals with no view counted yet, as a new episode starts from them; a mirrored axis is
+        lost."""
+        return tuple(
+            replace(
+                one,
+                hits=0,
+                misses=0,
+                axis_state=AxisState.KNOWN if one.axis_state == AxisState.KNOWN else AxisState.UNKNOWN,
+            )
+            for one in self.animals
+        )

@@ -12,26 +12,18 @@ that the views it should lie in confirm it. A ring of one has nobody to disagree
 consensus True.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from procs.registrar._chart import (
-    ViewGeometry,
-    fits_map,
-    local_view,
-    map_marks,
-    mapped_point,
-    merge_sight,
-    new_animal,
-    shifted,
-)
-from procs.registrar._marks import Marks, check_boxes
-from procs.registrar.box_icp import HEADING_PRIOR_STD_RAD, BoxAlignment, Prior, align_marks
+from procs.registrar._chart import ViewGeometry, fits_map, mapped_point, new_animal, shifted
+from procs.registrar._marks import check_boxes
+from procs.registrar._sight import Observer, Register, Sight, with_sight, without_sight
+from procs.registrar._verdict import CONSENSUS_CONFIDENCE, is_doubted, is_settled
+from procs.registrar.box_icp import align_marks
 from procs.registrar.map import (
-    COUNTER_LIMIT,
     MAX_ANIMALS,
     MapAnimal,
     MapHeader,
@@ -45,17 +37,9 @@ __all__ = ["NodeResult", "RingNode", "RingRegistration", "ViewGeometry", "regist
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.intp]
-Register = Callable[..., BoxAlignment]
 
-CONSENSUS_CONFIDENCE = 0.9
 FUSE_CONFIDENCE = 0.5  # below this a node passes the first lap's map on unfused and tries again on the second
 MAX_LAPS = 4
-MAX_RESIDUAL_SIZES = 0.6  # root mean square, in body sizes: more is no match, whatever the registration says
-LEAST_COVERAGE = 0.5  # of the animals that the map and the view both should hold
-SCALE_STD = 0.12  # of ln(own height over the first drone's): barometers drift by metres
-MEMORY_STD_M = 15.0  # how far a pod may have moved, as a whole, since the last episode
-MISS_DEPTH_SIZES = 0.5  # an animal nearer to the image's border than this is not missed
-MOST_DOUBTED = 0.2  # share of the map's animals that may be one view's false alarms
 
 CLOSED, CHANGED, REPAIRED, CONSENSUS, DONE = 1, 2, 4, 8, 16
 
@@ -66,7 +50,8 @@ class NodeResult:
 
     `identities` (N,) animal id of each own box, -1 where another view that should hold the animal did not
     confirm it; `confidence` 0-1, the least of the ring's edges; `map` the confirmed and the remembered
-    animals, in fleet NED metres as the first drone believes them; `transform` (3, 3) own px to map metres;
+    animals, in fleet NED metres as the first drone believes them; `memory` what the next episode starts
+    from; `transform` (3, 3) own px to map metres;
     `n_m`, `e_m`, `yaw_rad` where the map says that this drone's nadir and image top are (of its image
     centre, where the view's geometry is unknown); `has_pose` False where no box of this view is on the map,
     so that the pose is only what the drone believed.
@@ -78,22 +63,12 @@ class NodeResult:
     repaired: bool
     laps: int
     map: list[MapAnimal]
+    memory: Memory
     transform: Array
     n_m: float
     e_m: float
     yaw_rad: float
     has_pose: bool
-
-
-@dataclass
-class _Sight:
-    """One drone's latest word on the map: what it saw (box row -> id), what it missed, and how sure it is."""
-
-    ids: dict[int, int] = field(default_factory=dict)
-    missed: list[int] = field(default_factory=list)
-    to_chart: Array = field(default_factory=lambda: np.eye(3))
-    confidence: float = 0.0
-    has_pose: bool = False
 
 
 class RingNode:
@@ -125,14 +100,13 @@ class RingNode:
         self.drone_id, self.members = drone_id, list(members)
         self.episode, self.proposer = episode, proposer
         self.boxes = check_boxes(boxes, "boxes")
-        self.view, self.memory = view, memory or Memory()
-        self.register = register
-        self.marks, self.pixel_to_local = local_view(self.boxes, image_size, view)
+        self.memory = memory or Memory()
+        self._observer = Observer(self.boxes, image_size, view, self.memory, register)
         self.bytes_sent = 0
         self.packets_refused = 0
         self._lost: list[int] = []
         self._newest: tuple[MapHeader, list[MapAnimal], bytes] | None = None
-        self._sight = _Sight()
+        self._sight = Sight()
         self._fused = False
         self._result: NodeResult | None = None
 
@@ -166,7 +140,7 @@ class RingNode:
             return []
         header, animals, packet = self._newest
         if header.flags & DONE and not self.finished:
-            self._finish(header, animals)
+            self._finish(header, animals, now_s)
         self.bytes_sent += len(packet)
         return [packet]
 
@@ -204,7 +178,9 @@ class RingNode:
             header, animals, _ = self._newest
             opens_lap = header.rank >= rank
             if opens_lap and header.lap >= 2 and (not header.flags & CHANGED or header.lap >= MAX_LAPS):
-                header = replace(header, rank=rank, flags=header.flags | DONE | _verdict(header, animals))
+                header = replace(
+                    header, rank=rank, flags=header.flags | DONE | self._verdict(header, animals)
+                )
             else:
                 lap = header.lap + opens_lap
                 flags = header.flags & REPAIRED if opens_lap else header.flags
@@ -216,75 +192,52 @@ class RingNode:
 
     def _first_map(self, now_s: float) -> tuple[MapHeader, list[MapAnimal]]:
         """The map of this drone's boxes, with the ids of the remembered animals that they match."""
-        view = self.view
-        origin = (round(view.n_m, 1), round(view.e_m, 1)) if view else (0.0, 0.0)
-        yaw = view.yaw_rad % (2 * np.pi) if view else 0.0
+        view = self._observer.view
+        # Whole metres: the packet holds them exactly, as far as 32 km from the fleet's origin.
+        origin = (round(view.n_m), round(view.e_m)) if view else (0, 0)
         header = MapHeader(
-            *(
-                self.episode & 0xFFFF,
-                self.proposer,
-                1,
-                self.members.index(self.drone_id),
-                0,
-                1.0,
-                *origin,
-                yaw,
-            )
+            episode=self.episode & 0xFFFF,
+            proposer=self.proposer,
+            lap=1,
+            rank=self.members.index(self.drone_id),
+            flags=0,
+            confidence=1.0,
+            origin_n_m=origin[0],
+            origin_e_m=origin[1],
+            yaw_rad=view.yaw_rad % (2 * np.pi) if view else 0.0,
         )
-        to_chart = shifted(view.n_m - origin[0], view.e_m - origin[1]) if view else np.eye(3)
-        animals = self._remembered(header, to_chart, now_s)
-        self._sight = _Sight(to_chart=to_chart, confidence=1.0, has_pose=True)
-        remembered = self._match_memory(header, animals, to_chart)
-        chart_marks = self.marks.through(to_chart)
+        to_chart = self._observer.believed(header)
+        animals = self._observer.remembered(header, to_chart, now_s)
+        known = self._observer.match_memory(header, animals, to_chart)
         by_id = {one.id: one for one in animals}
-        for row in range(len(self.boxes)):
-            number = remembered.get(row)
-            if number is None:
-                number = self._free_id(by_id, now_s)
-            if number is None or not fits_map(chart_marks.centres[row], float(chart_marks.sizes[row])):
-                continue
-            by_id[number] = new_animal(chart_marks, row, _origin(header), number, is_first_view=True)
-            self._sight.ids[row] = number
+        self._sight = Sight(dict(known), [], to_chart, confidence=1.0, has_pose=True)
+        marks = self._observer.marks.through(to_chart)
+        for row, number in known.items():
+            by_id[number] = new_animal(marks, row, header.origin, number, is_first_view=True)
+        self._add_new(header, by_id, self._sight, Sight(), now_s, is_first_view=True)
         self._fused = True
         return header, list(by_id.values())
 
-    def _remembered(self, header: MapHeader, to_chart: Array, now_s: float) -> list[MapAnimal]:
-        """The remembered animals in this episode's map frame, no view counted yet."""
-        known = list(self.memory.known_at(now_s).forgotten_counts())[:MAX_ANIMALS]
-        if known and self.view is None and len(self.boxes):
-            # Pictures without geometry have no common ground: the remembered frame is found by the boxes
-            # alone.
-            old = map_marks(known, np.zeros(2), 0.0)
-            found = self.register(self.marks.through(to_chart), old, prior=Prior())
-            if len(found.matches) >= 2:
-                back = old.through(np.linalg.inv(found.transform))
-                known = [
-                    replace(
-                        one,
-                        n_m=float(place[0]),
-                        e_m=float(place[1]),
-                        size_m=float(size),
-                        axis_rad=float(axis % np.pi),
-                    )
-                    for one, place, size, axis in zip(
-                        known, back.centres, back.sizes, _axes(back), strict=True
-                    )
-                ]
-        origin = _origin(header)
-        return [one for one in known if fits_map(np.array([one.n_m, one.e_m]) - origin, one.size_m)]
-
-    def _match_memory(self, header: MapHeader, animals: list[MapAnimal], to_chart: Array) -> dict[int, int]:
-        """Own box row -> remembered id."""
-        if not animals or not len(self.boxes):
-            return {}
-        target = map_marks(animals, _origin(header), header.yaw_rad)
-        prior = Prior()
-        if self.view is not None:
-            prior = Prior(
-                (0.0, HEADING_PRIOR_STD_RAD), (0.0, SCALE_STD), (np.zeros(2), MEMORY_STD_M), np.zeros(2)
-            )
-        found = self.register(self.marks.through(to_chart), target, prior=prior)
-        return {int(row): animals[column].id for row, column in found.matches}
+    def _add_new(
+        self,
+        header: MapHeader,
+        by_id: dict[int, MapAnimal],
+        sight: Sight,
+        before: Sight,
+        now_s: float,
+        is_first_view: bool,
+    ) -> None:
+        """Put the boxes that the map lacks on it; one that this drone added before keeps its id."""
+        marks = self._observer.marks.through(sight.to_chart)
+        for row in range(len(self.boxes)):
+            if row in sight.ids or not fits_map(marks.centres[row], float(marks.sizes[row])):
+                continue
+            number = before.ids.get(row)
+            if number is None or number in sight.ids.values() or by_id[number].hits:
+                number = self._free_id(by_id, now_s)
+            if number is not None:
+                by_id[number] = new_animal(marks, row, header.origin, number, is_first_view)
+                sight.ids[row] = number
 
     def _free_id(self, by_id: dict[int, MapAnimal], now_s: float) -> int | None:
         if len(by_id) >= MAX_ANIMALS:
@@ -297,111 +250,32 @@ class RingNode:
     ) -> tuple[MapHeader, list[MapAnimal]]:
         """Match own boxes to the map and put this drone's word on it in place of its earlier word."""
         before, was_fused = self._sight, self._fused
-        sight, found = self._look(header, animals)
-        if header.lap == 1 and len(animals) and sight.confidence < FUSE_CONFIDENCE:
-            return replace(header, confidence=1.0), animals
-        animals = self._withdrawn(animals, before)
-        animals = self._entered(header, animals, sight, before, now_s)
+        sight, is_told = self._observer.look(header, animals)
+        if header.lap == 1 and animals and sight.confidence < FUSE_CONFIDENCE:
+            return header, animals
+        animals = without_sight(animals, before, len(self.members))
+        by_id = with_sight(header, animals, self._observer.marks, sight, before)
+        self._add_new(header, by_id, sight, before, now_s, is_first_view=False)
+        taken_back = [number for number in before.ids.values() if not by_id[number].hits]
+        remembered = [one.id for one in self.memory.animals]
+        animals = [one for one in by_id.values() if one.id not in taken_back or one.id in remembered]
         self._sight, self._fused = sight, True
         flags = header.flags
         if header.lap >= 2 and (not was_fused or sight.ids != before.ids):
             flags |= CHANGED | REPAIRED
-        if opens_lap and was_fused and sight.ids == before.ids and found:
+        if opens_lap and was_fused and sight.ids == before.ids and is_told:
             flags |= CLOSED
         least = sight.confidence if opens_lap else min(header.confidence, sight.confidence)
         return replace(header, flags=flags, confidence=least if header.lap >= 2 else 1.0), animals
 
-    def _look(self, header: MapHeader, animals: list[MapAnimal]) -> tuple[_Sight, bool]:
-        """Register own boxes against the map; False where there is nothing that registration could tell."""
-        believed = self._believed(header)
-        if not len(self.boxes) or not animals:
-            return _Sight(to_chart=believed, confidence=1.0), not len(self.boxes)
-        target = map_marks(animals, _origin(header), header.yaw_rad)
-        prior = Prior()
-        if self.view is not None:
-            prior = Prior((0.0, HEADING_PRIOR_STD_RAD), (0.0, SCALE_STD))
-        found = self.register(self.marks, target, prior=prior)
-        if not len(found.matches):
-            return _Sight(to_chart=believed), False
-        confidence = found.confidence if self._is_plausible(found, target) else 0.0
-        ids = {int(row): animals[column].id for row, column in found.matches}
-        sight = _Sight(ids, [], found.transform, confidence, has_pose=True)
-        sight.missed = self._missed(sight, animals, target)
-        return sight, True
+    def _verdict(self, header: MapHeader, animals: list[MapAnimal]) -> int:
+        """CONSENSUS or 0: closure, every edge's confidence and every animal's confirmation together."""
+        if len(self._living_ranks()) == 1:
+            return CONSENSUS
+        is_proved = header.flags & CLOSED and header.confidence >= CONSENSUS_CONFIDENCE
+        return CONSENSUS if is_proved and is_settled(animals, len(self._living_ranks())) else 0
 
-    def _believed(self, header: MapHeader) -> Array:
-        if self.view is None:
-            return np.eye(3)
-        return shifted(self.view.n_m - header.origin_n_m, self.view.e_m - header.origin_e_m)
-
-    def _is_plausible(self, found: BoxAlignment, target: Marks) -> bool:
-        """Residual and coverage, checked here so that no registration, however sure, is taken at its word."""
-        sizes = float(np.median(target.sizes[found.matches[:, 1]]))
-        mapped = self.marks.through(found.transform).centres
-        low, high = target.centres.min(axis=0) - sizes, target.centres.max(axis=0) + sizes
-        expected = int(((mapped > low) & (mapped < high)).all(axis=1).sum())
-        apart = mapped[found.matches[:, 0]] - target.centres[found.matches[:, 1]]
-        residual = float(np.sqrt((apart**2).sum(axis=1).mean()))
-        return residual <= MAX_RESIDUAL_SIZES * sizes and len(found.matches) >= LEAST_COVERAGE * expected
-
-    def _missed(self, sight: _Sight, animals: list[MapAnimal], target: Marks) -> list[int]:
-        """Ids of the animals that lie well inside this view and that no box of it matched."""
-        if self.marks.window is None:
-            return [one.id for one in animals if one.id not in sight.ids.values()]
-        back = target.through(np.linalg.inv(sight.to_chart))
-        depth = _depth_inside(back.centres, self.marks.window) / np.maximum(back.sizes, 1e-9)
-        inside = depth > MISS_DEPTH_SIZES
-        return [
-            one.id
-            for one, is_inside in zip(animals, inside, strict=True)
-            if is_inside and one.id not in sight.ids.values()
-        ]
-
-    def _withdrawn(self, animals: list[MapAnimal], sight: _Sight) -> list[MapAnimal]:
-        """The map without this drone's earlier counts."""
-        saturates = len(self.members) > COUNTER_LIMIT
-        result = []
-        for one in animals:
-            hit, miss = one.id in sight.ids.values(), one.id in sight.missed
-            hits = one.hits - (hit and not (saturates and one.hits == COUNTER_LIMIT))
-            misses = one.misses - (miss and not (saturates and one.misses == COUNTER_LIMIT))
-            result.append(replace(one, hits=max(hits, 0), misses=max(misses, 0)))
-        return result
-
-    def _entered(
-        self, header: MapHeader, animals: list[MapAnimal], sight: _Sight, before: _Sight, now_s: float
-    ) -> list[MapAnimal]:
-        """The map with this drone's hits, misses and new animals; animals that nobody sees any more are
-        taken out.
-        """
-        origin, chart_marks = _origin(header), self.marks.through(sight.to_chart)
-        by_id = {one.id: one for one in animals}
-        for row, number in sight.ids.items():
-            one = by_id[number]
-            if before.ids.get(row) == number:
-                by_id[number] = replace(one, hits=min(one.hits + 1, COUNTER_LIMIT))
-            else:
-                by_id[number] = merge_sight(one, chart_marks, row, origin, header.yaw_rad)
-        for number in sight.missed:
-            one = by_id[number]
-            by_id[number] = replace(one, misses=min(one.misses + 1, COUNTER_LIMIT))
-        remembered = {one.id for one in self.memory.animals}
-        own = {number for number in before.ids.values()}
-        by_id = {
-            number: one
-            for number, one in by_id.items()
-            if one.hits or number in remembered or number not in own
-        }
-        for row in range(len(self.boxes)):
-            if row in sight.ids or not fits_map(chart_marks.centres[row], float(chart_marks.sizes[row])):
-                continue
-            new = self._free_id(by_id, now_s)
-            if new is not None:
-                by_id[new] = new_animal(chart_marks, row, origin, new, is_first_view=False)
-                sight.ids[row] = new
-        return list(by_id.values())
-
-    def _finish(self, header: MapHeader, animals: list[MapAnimal]) -> None:
+    def _finish(self, header: MapHeader, animals: list[MapAnimal], now_s: float) -> None:
         by_id = {one.id: one for one in animals}
         identities = np.full(len(self.boxes), -1, dtype=np.intp)
         for row, number in self._sight.ids.items():
@@ -411,59 +285,27 @@ class RingNode:
         place = mapped_point(to_map, np.zeros(2))
         ahead = mapped_point(to_map, np.array([1.0, 0.0])) - place
         turn = float(np.arctan2(ahead[1], ahead[0]))
+        agreed = [one for one in animals if not is_doubted(one)]
+        view = self._observer.view
         self._result = NodeResult(
             identities=identities,
             consensus=bool(header.flags & CONSENSUS),
             confidence=header.confidence,
             repaired=bool(header.flags & REPAIRED),
             laps=header.lap,
-            map=[one for one in animals if not is_doubted(one)],
-            transform=to_map @ self.pixel_to_local,
+            map=agreed,
+            memory=self.memory.after(agreed, now_s),
+            transform=to_map @ self._observer.pixel_to_local,
             n_m=float(place[0]),
             e_m=float(place[1]),
-            yaw_rad=(turn + (self.view.yaw_rad if self.view else 0.0)) % (2 * np.pi),
+            yaw_rad=(turn + (view.yaw_rad if view else 0.0)) % (2 * np.pi),
             has_pose=self._sight.has_pose,
         )
 
 
-def is_doubted(animal: MapAnimal) -> bool:
-    """One view says it is there, and at least one that should see it does not."""
-    return animal.hits == 1 and animal.misses > 0
-
-
 def _age(header: MapHeader) -> tuple[bool, int, int]:
+    """Orders the maps of one episode: the newest is the one to keep and to repeat."""
     return bool(header.flags & DONE), header.lap, header.rank
-
-
-def _origin(header: MapHeader) -> Array:
-    return np.array([header.origin_n_m, header.origin_e_m])
-
-
-def _axes(marks: Marks) -> Array:
-    shapes = marks.shapes[:, 0]
-    return np.asarray(np.arctan2(2 * shapes[:, 0, 1], shapes[:, 0, 0] - shapes[:, 1, 1]) / 2)
-
-
-def _depth_inside(points: Array, polygon: Array) -> Array:
-    """(N, 2) points -> (N,) signed distance to a convex polygon's nearest edge, positive inside."""
-    edges = np.roll(polygon, -1, axis=0) - polygon
-    normals = np.column_stack([-edges[:, 1], edges[:, 0]]) / np.linalg.norm(edges, axis=1, keepdims=True)
-    depth = points @ normals.T - (polygon * normals).sum(axis=1)
-    middle = polygon.mean(axis=0) @ normals.T - (polygon * normals).sum(axis=1)
-    return np.asarray((depth * np.sign(middle)).min(axis=1))
-
-
-def _verdict(header: MapHeader, animals: Sequence[MapAnimal]) -> int:
-    """CONSENSUS or 0: closure, every edge's confidence, and every animal's confirmation together."""
-    if not header.flags & CLOSED or header.confidence < CONSENSUS_CONFIDENCE:
-        return 0
-    counted = [one for one in animals if one.hits > 0]
-    doubted = [one for one in counted if is_doubted(one)]
-    # One view against one is a draw; one against several is a false alarm, which some detectors have.
-    if any(one.misses < 2 for one in doubted) or len(doubted) > MOST_DOUBTED * len(counted):
-        return 0
-    settled = all(one.misses <= max(1, 0.34 * (one.hits + one.misses)) for one in counted if one.hits > 1)
-    return CONSENSUS if settled else 0
 
 
 @dataclass(frozen=True)
@@ -520,6 +362,6 @@ def register_ring(
         repaired=results[0].repaired,
         laps=results[0].laps,
         bytes_sent=np.array([node.bytes_sent for node in nodes]),
-        memory=(memory or Memory()).after(results[0].map, now_s),
+        memory=results[0].memory,
         confidence=results[0].confidence,
     )
