@@ -144,7 +144,9 @@ class LiveView:
 
     def render(self) -> RenderableType:
         """The picture of this moment."""
-        return Group(self._progress_line(), self._table(), *self._event_lines())
+        return Group(
+            self._progress_line(), Text(), self._table(), Text(), *self._trouble_lines(), *self._event_lines()
+        )
 
     def _hear_state(self, drone_id: int, row: _Row, message: Any, now_s: float) -> None:
         before, row.state, row.reason = row.state, message.state, message.reason
@@ -170,7 +172,8 @@ class LiveView:
 
     def _progress_line(self) -> Text:
         stage = self._stage()
-        line = Text(f"{self._title}  " if self._title else "", style="bold", no_wrap=True)
+        line = Text(f"{self._title}  " if self._title else "", style="bold")
+        line.append(f"{self._now_s:.0f} s, {self._factor:.2f} x real time\n", style="default not bold")
         names = [name for name, _ in STAGES]
         reached = names.index(stage) if stage else -1
         for index, name in enumerate(names):
@@ -178,7 +181,6 @@ class LiveView:
             if index == reached:
                 mark, style = "◉", "bold cyan"
             line.append(f"{mark} {self._stage_text(name, index == reached)}  ", style=style)
-        line.append(f" {self._now_s:.0f} s, {self._factor:.2f} x real time", style="default not bold")
         return line
 
     def _stage_text(self, name: str, is_now: bool) -> str:
@@ -187,14 +189,13 @@ class LiveView:
         return name
 
     def _table(self) -> Table:
-        table = Table(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
+        table = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, 1, 0, 0))
         table.add_column("drone", no_wrap=True)
         table.add_column("state", min_width=10, no_wrap=True)
         for title in ("animal", "height", "battery", "links", "camera", "detect", "track", "log"):
             table.add_column(title, justify="right", no_wrap=True, min_width=5)
-        table.add_column("trouble", overflow="fold")  # the one column that may wrap in a narrow terminal
         for drone_id, row in self._rows.items():
-            table.add_row(str(drone_id), self._state(row), *_cells(row, self._now_s), self._trouble(row))
+            table.add_row(str(drone_id), self._state(row), *_cells(row, self._now_s))
         return table
 
     def _state(self, row: _Row) -> Text:
@@ -203,17 +204,20 @@ class LiveView:
         style = STATE_STYLE.get(State(row.state), "") if row.state in State.__members__.values() else "red"
         return Text(state_name(row.state), style=style)
 
-    def _trouble(self, row: _Row) -> Text:
-        silent_s = self._now_s - row.heard_s
-        if row.state is not None and silent_s > SILENT_AFTER_S:
-            return Text(f"silent for {silent_s:.0f} s", style="bold red")
-        words = []
-        for process, (when_s, beat) in sorted(row.beats.items()):
-            if self._now_s - when_s > SILENT_AFTER_S:
-                words.append(f"{process} silent")
-            elif beat.status != heartbeat_t.OK:
-                words.append(f"{process}: {beat.detail}")
-        return Text(", ".join(words), style="yellow")
+    def _trouble_lines(self) -> list[Text]:
+        """What is wrong now, one line a drone and process."""
+        lines = []
+        for drone_id, row in self._rows.items():
+            silent_s = self._now_s - row.heard_s
+            if row.state is not None and silent_s > SILENT_AFTER_S:
+                lines.append(Text(f" ! drone {drone_id}: silent for {silent_s:.0f} s", style="bold red"))
+                continue
+            for process, (when_s, beat) in sorted(row.beats.items()):
+                if self._now_s - when_s > SILENT_AFTER_S:
+                    lines.append(Text(f" ! drone {drone_id}: {process} silent", style="bold red"))
+                elif beat.status != heartbeat_t.OK:
+                    lines.append(Text(f" ! drone {drone_id}: {process}: {beat.detail}", style="yellow"))
+        return [*lines, Text()] if lines else []
 
     def _event_lines(self) -> list[Text]:
         return [Text(f"{t_s:7.1f} s  {text}", style="dim", no_wrap=True) for t_s, text in self._events]
