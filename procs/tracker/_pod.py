@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from procs.tracker._body import Body, body_of_weights
+from procs.tracker._sight import locate
 
 __all__ = ["claimed_by", "followed", "refreshed", "settle", "within_reach"]
 
@@ -19,6 +20,7 @@ CLAIM_REACH = 1.6  # radius of an ellipse within which pixels may be its own
 BOX_SLACK = 1.08  # boxes are drawn loose, seldom tight
 SETTLE_ROUNDS = 6
 FOLLOW_REACH = 1.5  # radius within which a companion is looked for
+FOLLOW_SEARCH = 0.35  # of its length, for one that the edge of the picture cuts
 FOLLOW_RATE = 0.7  # share of the seen place that a companion takes over a look
 TURN_RATE = 0.3
 SIZE_RATE = 0.1
@@ -85,13 +87,15 @@ def followed(evidence: Map, body: Body, rivals: list[Body]) -> Body | None:
     """
     size = (evidence.shape[1], evidence.shape[0])
     radius = body.radius(size)
-    theirs = (evidence > 0) & (radius < FOLLOW_REACH)
-    for rival in rivals:
-        if within_reach(rival, size):
-            theirs &= radius < rival.radius(size)
+    claimed = claimed_by(rivals, radius, outright=False)
+    theirs = (evidence > 0) & (radius < FOLLOW_REACH) & ~claimed
     seen = body_of_weights(theirs.astype(np.float32), body.angle_rad)
-    if seen is None or _touches_edge(theirs) or theirs.sum() < LEAST_SHARE * body.area_px:
+    if seen is None or theirs.sum() < LEAST_SHARE * (radius < 1).sum():
         return None
+    if _touches_edge(theirs):
+        # Half an animal has another middle and another shape: only the whole ellipse is moved.
+        free = np.where(claimed, np.float32(0), evidence)
+        return replace(body, centre=locate(free, body, FOLLOW_SEARCH * body.length_px))
     return Body(
         body.centre + FOLLOW_RATE * (seen.centre - body.centre),
         body.length_px * (seen.length_px / body.length_px) ** SIZE_RATE,
