@@ -33,7 +33,7 @@ CHUNK_MARK_OFFSET = RECORD_HEAD.size + 28  # behind its start and end time, its 
 MAX_CHUNK_BYTES = 1 << 30  # uncompressed; a damaged size must not take the machine's memory
 DEFINITIONS = (Opcode.SCHEMA, Opcode.CHANNEL)
 WANTED = (*DEFINITIONS, Opcode.MESSAGE, Opcode.CHUNK, Opcode.METADATA)
-DAMAGE = (McapError, ValueError, RuntimeError, MemoryError, struct.error, zstandard.ZstdError)
+DAMAGE = (McapError, ValueError, RuntimeError, MemoryError, OverflowError, struct.error, zstandard.ZstdError)
 
 R = TypeVar("R")
 

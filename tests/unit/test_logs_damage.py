@@ -187,6 +187,15 @@ def test_a_chunk_with_a_wrong_checksum_is_named_by_its_offset_and_left_out(tmp_p
         list(read(path, strict=True))
 
 
+def test_a_chunk_that_claims_more_than_memory_can_hold_is_damage(tmp_path, closed_log):
+    top_of_length = chunk_offsets(closed_log)[1] + CHUNK_MARK_OFFSET + len(CHUNK_MARK) + 7
+    path = tmp_path / "a.mcap"
+    path.write_bytes(closed_log[:top_of_length] + b"\x80" + closed_log[top_of_length + 1 :])
+    seqs, texts = read_with_warnings(path)
+    assert seqs == [*range(20), *range(40, 100)]
+    assert f"the chunk at byte {chunk_offsets(closed_log)[1]}" in texts[0]
+
+
 def test_reading_goes_on_behind_a_damaged_length(tmp_path, killed_log):
     offset, following = chunk_offsets(killed_log)[1:3]
     path = tmp_path / "a.mcap"
