@@ -8,39 +8,24 @@ modes (the pilot's stick, a failsafe) keeps it; the bridge never disarms.
 import math
 from typing import Any
 
-from drivers.autopilots.ardupilot import (
-    AUTOPILOT_COMPONENT,
-    GROUND_SYSTEM,
-    POSITION_VELOCITY_YAW,
-    VELOCITY_YAW,
-    Codec,
-    Mode,
-    mavlink,
-)
+from drivers.autopilots.ardupilot import AUTOPILOT_COMPONENT, GROUND_SYSTEM, Codec, Mode, mavlink
 from lcmtypes.podwatch import setpoint_t
-from procs.autopilot.authority import Authority
-from procs.autopilot.limits import Envelope, Follower, Vector
-from procs.autopilot.requests import Commands, Parameters, Streams
+from procs.autopilot.flyer import LONG_AGO_US, Flyer
+from procs.autopilot.limits import Vector
+from procs.autopilot.requests import Parameters, Streams
 from procs.autopilot.telemetry import STREAMS_HZ, Telemetry
 from procs.settings import LimitSettings, Mission
 
 __all__ = ["Bridge"]
 
 HEARTBEAT_US = 1_000_000  # fact 3
-WRITE_US = 45_000  # a live setpoint is written anew at 20 Hz
-LONGEST_LIFE_US = 2_000_000  # whatever a setpoint says of its expiry
-BRAKE_AFTER_US = 1_000_000  # of zero velocity without a live setpoint
 SILENT_POSITION_US = 3_000_000  # after which the streams are asked for again
-CLIMB_REACHED_M = 0.5
-CLIMB_STALLED_US = 6_000_000  # without a new greatest height
-CLIMB_PROGRESS_M = 0.2
-LONGEST_STEP_S = 0.2
 # The failsafe must outlast a restart of this process: 2 s until the supervisor acts and up to 3.3 s of
 # imports.
 GROUND_SILENCE_S = 10.0
 FENCE_MARGIN_M = 20.0  # of the autopilot's own fence beyond ours, which acts first
 LARGEST_CIRCLE_M = 10_000.0  # that ArduCopter's fence takes
-KINDS = range(setpoint_t.IDLE, setpoint_t.LAND + 1)
+NEVER_HEARD_MS = 2**31 - 1
 
 
 class Bridge:
@@ -58,36 +43,15 @@ class Bridge:
         system_id: int = GROUND_SYSTEM,
         target_system: int | None = None,
     ) -> None:
-        self.drone_id = drone_id
         self.target_system = drone_id if target_system is None else target_system
         self.telemetry = Telemetry(mission.origin)
-        self.n_expired = 0
-        self.n_clamped = 0
-        self.n_refused = 0  # setpoints with a number that is none, of an unknown kind, or for another drone
+        self.flyer = Flyer(drone_id, mission.limits, self.telemetry, self._send_setpoint)
         self._codec = Codec(system_id, mavlink.MAV_COMP_ID_MISSIONPLANNER)
-        self._authority = Authority()
-        self._envelope = Envelope(mission.limits)
-        self._commands = Commands()
         self._streams = Streams(STREAMS_HZ)
         self._parameters = Parameters(_wishes(mission, drone_id, system_id))
-        self._heartbeat_due_us = 0
+        self._heartbeat_due_us = LONG_AGO_US
         self._streams_asked_us = 0
         self._foreign_system = 0
-        self._setpoint: setpoint_t | None = None
-        self._received_us = 0
-        self._passed_on: tuple[int, int] = (0, 0)  # utime of the last setpoint passed on, its age then
-        self._clamped_utime = -1
-        self._written_us = 0
-        self._silent_since_us: int | None = None
-        self._hold_yaw_rad: float | None = None
-        self._follower: Follower | None = None
-        self._climb_d: float | None = (
-            None  # height to which NAV_TAKEOFF climbs, fleet's frame, None outside a climb
-        )
-        self._highest_d = 0.0
-        self._highest_us = 0
-
-    # In.
 
     def receive(self, data: bytes, utime: int) -> None:
         """Bytes from the link. Only the target's autopilot component is heard (fact 13)."""
@@ -101,29 +65,16 @@ class Bridge:
                 self._begin(utime)
             kind = message.get_type()
             if kind == "HEARTBEAT":
-                self._authority.observe(self.telemetry.mode, utime)
+                self.flyer.authority.observe(self.telemetry.mode, utime)
             elif kind == "COMMAND_ACK" and message.target_system in (0, self._codec.send.srcSystem):
                 self._answered(message, utime)
             elif kind == "PARAM_VALUE":
-                name = message.param_id
-                self._parameters.heard(name if isinstance(name, str) else name.decode(), message.param_value)
+                self._parameters.heard(message.param_id, message.param_value)
 
     def setpoint(self, setpoint: setpoint_t, utime: int) -> bytes:
         """What the navigator wants now; returns what to write at once."""
-        if not self._is_sound(setpoint):
-            self.n_refused += 1
-            return b""
-        if self._setpoint is not None and setpoint.utime < self._setpoint.utime:
-            return b""  # an older one that came late
-        if utime > setpoint.expiry_utime:
-            self.n_expired += 1
-            return b""
-        self._setpoint = setpoint
-        self._received_us = utime
-        if self.telemetry.landed and setpoint.kind != setpoint_t.TAKEOFF:
-            self._authority.may_begin_anew()
-        self._fly(utime)
-        return self._take()
+        self.flyer.hear(setpoint, utime)
+        return self._codec.take()
 
     def step(self, utime: int) -> bytes:
         """What to write to the link now."""
@@ -134,28 +85,26 @@ class Bridge:
             )
         if self.telemetry.link_ok(utime):
             self._ask(utime)
-            if utime - self._written_us >= WRITE_US:
-                self._fly(utime)
-            self._send_commands(utime)
-        return self._take()
+            self.flyer.repeat(utime)
+            for command in self.flyer.commands.due(utime):
+                self._send_command(command.command, command.parameters, command.confirmation)
+        return self._codec.take()
 
     def farewell(self, utime: int) -> bytes:
         """What to write when this process ends in the air: stop, or it would fly on for 3 s (fact 2)."""
         telemetry = self.telemetry
         if telemetry.link_ok(utime) and telemetry.mode == Mode.GUIDED and not telemetry.landed:
-            self._hold(utime)
-        return self._take()
-
-    # Out.
+            self.flyer.hold(utime)
+        return self._codec.take()
 
     def state(self, utime: int) -> dict[str, Any]:
         """The fields of vehicle_state_t by name; its `utime` is when the position arrived, 0 for never."""
-        telemetry = self.telemetry
+        telemetry, flyer = self.telemetry, self.flyer
         n_m, e_m, d_m = telemetry.place
         vn_m_s, ve_m_s, vd_m_s = telemetry.velocity
-        heard = telemetry.heartbeat_utime
+        heard_us = telemetry.heartbeat_utime
         return {
-            "utime": telemetry.position_utime,
+            "utime": telemetry.position_utime or 0,
             "n_m": n_m,
             "e_m": e_m,
             "d_m": d_m,
@@ -169,13 +118,13 @@ class Bridge:
             "position_ok": telemetry.position_ok(utime),
             "armed": telemetry.armed,
             "landed": telemetry.landed,
-            "guided": self._authority.is_ours and telemetry.link_ok(utime),
+            "guided": flyer.authority.is_ours and telemetry.link_ok(utime),
             "flight_mode": telemetry.mode,
-            "link_age_ms": (utime - heard) // 1000 if heard else utime // 1000 % 2**31,
-            "setpoint_utime": self._passed_on[0],
-            "setpoint_age_us": self._passed_on[1],
-            "n_expired": self.n_expired,
-            "n_clamped": self.n_clamped,
+            "link_age_ms": NEVER_HEARD_MS if heard_us is None else (utime - heard_us) // 1000,
+            "setpoint_utime": flyer.passed_on[0],
+            "setpoint_age_us": flyer.passed_on[1],
+            "n_expired": flyer.n_expired,
+            "n_clamped": flyer.n_clamped,
         }
 
     def problem(self, utime: int) -> str:
@@ -188,27 +137,21 @@ class Bridge:
                     "set its MAV_SYSID, or system_id in the link's options"
                 )
             return "the autopilot is not heard; is it powered, and the link's address right?"
-        wants_off = self._setpoint is not None and self._setpoint.kind == setpoint_t.TAKEOFF
-        if wants_off and not telemetry.armed and telemetry.text:
+        if self.flyer.wants_to_take_off() and not telemetry.armed and telemetry.text:
             return f"the autopilot does not arm: {telemetry.text}"
         unset = self._parameters.problem()
         return f"the autopilot's failsafes are not all set: {unset}" if unset else ""
 
-    # Asking.
-
     def _begin(self, utime: int) -> None:
         """A new link or a restarted autopilot: ask for everything again."""
-        self._authority = Authority()
-        self._commands = Commands()
+        self.flyer.restart()
         self._streams.restart(utime)
         self._streams_asked_us = utime
         self._parameters.restart(utime)
-        self._climb_d = None
-        self._follower = None
 
     def _ask(self, utime: int) -> None:
-        silent_since_us = max(self.telemetry.position_utime, self._streams_asked_us)
-        if self._streams.is_done and utime - silent_since_us > SILENT_POSITION_US:
+        position_us = self.telemetry.position_utime or LONG_AGO_US
+        if self._streams.is_done and utime - max(position_us, self._streams_asked_us) > SILENT_POSITION_US:
             self._streams.restart(utime)
             self._streams_asked_us = utime
         stream = self._streams.due(utime)
@@ -219,9 +162,13 @@ class Bridge:
                 self.target_system, AUTOPILOT_COMPONENT, name.encode(), value, mavlink.MAV_PARAM_TYPE_REAL32
             )
 
-    def _send_commands(self, utime: int) -> None:
-        for command in self._commands.due(utime):
-            self._send_command(command.command, command.parameters, command.confirmation)
+    def _answered(self, message: Any, utime: int) -> None:
+        if message.command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL:
+            self._streams.answered(utime)
+            return
+        command = self.flyer.commands.answered(message.command, message.result, utime)
+        if command is not None:
+            self.flyer.accepted(command, utime)
 
     def _send_command(self, command: int, parameters: tuple[float, ...], confirmation: int) -> None:
         filled = (*parameters, *([0.0] * (7 - len(parameters))))
@@ -229,193 +176,8 @@ class Bridge:
             self.target_system, AUTOPILOT_COMPONENT, command, confirmation, *filled
         )
 
-    def _answered(self, message: Any, utime: int) -> None:
-        if message.command == mavlink.MAV_CMD_SET_MESSAGE_INTERVAL:
-            self._streams.answered(utime)
-            return
-        done = self._commands.answered(message.command, message.result, utime)
-        if done is None:
-            return
-        # An acknowledgement comes up to a second before the HEARTBEAT that shows its effect.
-        if done.command == mavlink.MAV_CMD_DO_SET_MODE:
-            self.telemetry.mode = int(done.parameters[1])
-            self._authority.observe(self.telemetry.mode, utime)
-        elif done.command == mavlink.MAV_CMD_COMPONENT_ARM_DISARM:
-            self.telemetry.armed = True
-        elif done.command == mavlink.MAV_CMD_NAV_TAKEOFF:
-            self._climb_d = self.telemetry.place[2] - done.parameters[6]
-            self._highest_d, self._highest_us = self.telemetry.place[2], utime
-
-    def _ask_mode(self, mode: Mode, utime: int) -> None:
-        if self.telemetry.mode != mode:
-            self._authority.ask(mode, utime)
-            custom = float(mavlink.MAV_MODE_FLAG_CUSTOM_MODE_ENABLED)
-            self._commands.ask(mavlink.MAV_CMD_DO_SET_MODE, custom, float(mode), utime=utime)
-
-    # Flying.
-
-    def _is_sound(self, setpoint: setpoint_t) -> bool:
-        numbers = (
-            setpoint.n_m,
-            setpoint.e_m,
-            setpoint.d_m,
-            setpoint.vn_m_s,
-            setpoint.ve_m_s,
-            setpoint.vd_m_s,
-        )
-        return (
-            setpoint.drone_id == self.drone_id
-            and setpoint.kind in KINDS
-            and all(math.isfinite(x) for x in (*numbers, setpoint.yaw_rad))
-        )
-
-    def _live(self, utime: int) -> setpoint_t | None:
-        """The newest setpoint while it lives; counts it when it is found dead."""
-        setpoint = self._setpoint
-        if setpoint is None:
-            return None
-        if utime > min(setpoint.expiry_utime, self._received_us + LONGEST_LIFE_US):
-            self.n_expired += 1
-            self._setpoint = None
-            return None
-        return setpoint
-
-    def _fly(self, utime: int) -> None:
-        """Turn what is wanted into commands and setpoints."""
-        setpoint = self._live(utime)
-        if self.telemetry.landed:
-            self._stand(setpoint, utime)
-            return
-        if not self._authority.is_ours:
-            self._let_go()
-            return
-        if setpoint is None:
-            self._wait(utime)
-            return
-        self._silent_since_us = None
-        if setpoint.kind == setpoint_t.LAND:
-            self._ask_mode(Mode.LAND, utime)
-        elif setpoint.kind == setpoint_t.RETURN:
-            self._ask_mode(Mode.RTL, utime)
-        elif self.telemetry.mode != Mode.GUIDED:
-            self._ask_mode(Mode.GUIDED, utime)
-        elif not self._holds_back(setpoint, utime):
-            self._pass_on(setpoint, utime)
-        if self.telemetry.mode != Mode.GUIDED:
-            self._follower = self._hold_yaw_rad = self._climb_d = None
-
-    def _let_go(self) -> None:
-        """Somebody else flies: want nothing."""
-        self._follower = self._hold_yaw_rad = self._climb_d = self._silent_since_us = None
-        self._commands.drop(mavlink.MAV_CMD_DO_SET_MODE)
-
-    def _stand(self, setpoint: setpoint_t | None, utime: int) -> None:
-        """On the ground only TAKEOFF does anything: GUIDED, arm, NAV_TAKEOFF, in this order (fact 7)."""
-        self._follower = self._hold_yaw_rad = self._silent_since_us = None
-        wanted = setpoint is not None and setpoint.kind == setpoint_t.TAKEOFF
-        if setpoint is None or not wanted or not self._authority.may_take_off:
-            self._climb_d = None
-            for command in (mavlink.MAV_CMD_COMPONENT_ARM_DISARM, mavlink.MAV_CMD_NAV_TAKEOFF):
-                self._commands.drop(command)
-            return
-        if self.telemetry.mode != Mode.GUIDED:
-            self._ask_mode(Mode.GUIDED, utime)
-        elif not self.telemetry.armed:
-            self._climb_d = None
-            self._commands.ask(mavlink.MAV_CMD_COMPONENT_ARM_DISARM, 1.0, utime=utime)
-        elif self._climb_d is None:
-            self._ask_take_off(setpoint, utime)
-        elif utime - self._highest_us > CLIMB_STALLED_US:
-            self._climb_d = None
-        self._note_passed(setpoint, utime)
-
-    def _ask_take_off(self, setpoint: setpoint_t, utime: int) -> None:
-        if not self.telemetry.position_ok(utime):
-            return
-        _, _, goal_d = self._clamped_goal(setpoint)
-        height_m = round(
-            self.telemetry.place[2] - goal_d, 1
-        )  # above home, which is here; rounded to be one wish
-        self._commands.ask(mavlink.MAV_CMD_NAV_TAKEOFF, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, height_m, utime=utime)
-
-    def _holds_back(self, setpoint: setpoint_t, utime: int) -> bool:
-        """Whether NAV_TAKEOFF still climbs: any setpoint would end it (fact 7). HOLD may."""
-        if self._climb_d is None:
-            return False
-        d = self.telemetry.place[2]
-        if d < self._highest_d - CLIMB_PROGRESS_M:
-            self._highest_d, self._highest_us = d, utime
-        stalled = utime - self._highest_us > CLIMB_STALLED_US
-        if (
-            d <= self._climb_d + CLIMB_REACHED_M
-            or stalled
-            or setpoint.kind in (setpoint_t.HOLD, setpoint_t.IDLE)
-        ):
-            self._climb_d = None
-            return False
-        self._note_passed(setpoint, utime)
-        return True
-
-    def _wait(self, utime: int) -> None:
-        """No live setpoint in the air: stand still at once, and hand over to BRAKE soon after (fact 2)."""
-        self._climb_d = None
-        if self.telemetry.mode != Mode.GUIDED:
-            return  # LAND, RTL or BRAKE, as asked
-        if self._silent_since_us is None:
-            self._silent_since_us = utime
-        self._hold(utime)
-        if utime - self._silent_since_us >= BRAKE_AFTER_US:
-            self._ask_mode(Mode.BRAKE, utime)
-
-    def _pass_on(self, setpoint: setpoint_t, utime: int) -> None:
-        """Write a live setpoint, clamped."""
-        self._note_passed(setpoint, utime)
-        moves = setpoint.kind in (setpoint_t.GOTO, setpoint_t.VELOCITY, setpoint_t.TAKEOFF)
-        if not moves or not self.telemetry.position_ok(utime):  # without a position no fence can be kept
-            self._hold(utime)
-            return
-        self._hold_yaw_rad = None
-        if setpoint.kind == setpoint_t.VELOCITY:
-            self._follower = None
-            wanted = (setpoint.vn_m_s, setpoint.ve_m_s, setpoint.vd_m_s)
-            velocity = self._envelope.velocity(self.telemetry.place, wanted)
-            self._count_clamped(velocity != wanted)
-            self._write(VELOCITY_YAW, (0.0, 0.0, 0.0), velocity, setpoint.yaw_rad, utime)
-        else:
-            self._go(setpoint, utime)
-
-    def _go(self, setpoint: setpoint_t, utime: int) -> None:
-        """Lead the vehicle to a place by a stream of position and velocity (fact 9)."""
-        telemetry = self.telemetry
-        goal = self._clamped_goal(setpoint)
-        moving = (setpoint.vn_m_s, setpoint.ve_m_s, setpoint.vd_m_s)
-        if setpoint.kind == setpoint_t.TAKEOFF:  # in the air already: the rest of the climb, straight up
-            goal = (*(self._follower.place if self._follower else telemetry.place)[:2], goal[2])
-            moving = (0.0, 0.0, 0.0)
-        allowed = self._envelope.speed(moving)
-        self._count_clamped(allowed != moving)
-        if self._follower is None:
-            self._follower = Follower(self._envelope, telemetry.place, telemetry.velocity)
-        dt_s = min((utime - self._written_us) / 1e6, LONGEST_STEP_S)
-        self._follower.step(goal, allowed, telemetry.place, dt_s)
-        place = telemetry.local(self._follower.place)
-        self._write(POSITION_VELOCITY_YAW, place, self._follower.velocity, setpoint.yaw_rad, utime)
-
-    def _clamped_goal(self, setpoint: setpoint_t) -> Vector:
-        wanted = (setpoint.n_m, setpoint.e_m, setpoint.d_m)
-        goal = self._envelope.position(wanted)
-        self._count_clamped(goal != wanted)
-        return goal
-
-    def _hold(self, utime: int) -> None:
-        """Zero velocity, nose where it was when the hold began."""
-        self._follower = None
-        if self._hold_yaw_rad is None:
-            self._hold_yaw_rad = self.telemetry.yaw_rad
-        zero = (0.0, 0.0, 0.0)
-        self._write(VELOCITY_YAW, zero, zero, self._hold_yaw_rad, utime)
-
-    def _write(self, mask: int, place: Vector, velocity: Vector, yaw_rad: float, utime: int) -> None:
+    def _send_setpoint(self, mask: int, place: Vector, velocity: Vector, yaw_rad: float, utime: int) -> None:
+        no_acceleration, no_yaw_rate = (0.0, 0.0, 0.0), 0.0
         self._codec.send.set_position_target_local_ned_send(
             utime // 1000 % 2**32,
             self.target_system,
@@ -424,33 +186,14 @@ class Bridge:
             mask,
             *place,
             *velocity,
-            0.0,
-            0.0,
-            0.0,
+            *no_acceleration,
             yaw_rad,
-            0.0,
+            no_yaw_rate,
         )
-        self._written_us = utime
-
-    def _note_passed(self, setpoint: setpoint_t, utime: int) -> None:
-        """Remember a setpoint's age when it was first passed on."""
-        if self._passed_on[0] != setpoint.utime:
-            self._passed_on = (setpoint.utime, utime - setpoint.utime)
-
-    def _count_clamped(self, was_clamped: bool) -> None:
-        """Count each setpoint once, however often it is written."""
-        if was_clamped and self._setpoint is not None and self._clamped_utime != self._setpoint.utime:
-            self._clamped_utime = self._setpoint.utime
-            self.n_clamped += 1
-
-    def _take(self) -> bytes:
-        return self._codec.take()
 
 
 def _wishes(mission: Mission, drone_id: int, system_id: int) -> list[tuple[tuple[str, float], ...]]:
-    """The parameters that the bridge sets; alternatives are the names, and units, of other versions (fact
-    14).
-    """
+    """The parameters that the bridge sets, with the names and units of other versions (fact 14)."""
     limits = mission.limits
     home = mission.home(drone_id)
     # The autopilot's circle is round its home, ours round the fleet's origin: wide enough to hold ours.

@@ -25,6 +25,7 @@ class Autopilot:
         self._link = runtime.open("autopilot")
         target_system = self._link.system_id or runtime.drone_id
         self._bridge = Bridge(runtime.settings.mission, runtime.drone_id, target_system=target_system)
+        self._n_refused = 0
         runtime.attach(self._link, self.heard)
 
     def heard(self) -> None:
@@ -49,11 +50,17 @@ class Autopilot:
             runtime.degraded(problem, cause="autopilot")
         else:
             runtime.ok("autopilot")
-        if self._bridge.n_refused:
+        n_refused, self._n_refused = (
+            self._bridge.flyer.n_refused - self._n_refused,
+            self._bridge.flyer.n_refused,
+        )
+        if n_refused:
             runtime.degraded(
-                f"{self._bridge.n_refused} setpoints refused: not finite, of unknown kind or for another drone",
+                f"{n_refused} setpoints refused: not finite, of unknown kind or for another drone",
                 cause="refused",
             )
+        else:
+            runtime.ok("refused")
 
     def close(self) -> None:
         """Stop the vehicle, then the link."""

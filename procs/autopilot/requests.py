@@ -56,7 +56,7 @@ class Commands:
         return due
 
     def answered(self, command: int, result: int, utime: int) -> Command | None:
-        """The command that a COMMAND_ACK accepts, None where it accepts none; a refused one is asked again."""
+        """The command that a COMMAND_ACK accepts, if any; a refused one is asked again later."""
         waiting = self._waiting.get(command)
         if waiting is None or not waiting.sent or result == mavlink.MAV_RESULT_IN_PROGRESS:
             return None

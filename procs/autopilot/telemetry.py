@@ -1,5 +1,6 @@
 """What the autopilot says of itself, put together, and turned into the fleet's frame."""
 
+import math
 from typing import Any
 
 import pymap3d
@@ -24,11 +25,11 @@ STREAMS_HZ = (
 
 
 class Telemetry:
-    """The newest of each message. Times are the bridge's, us, 0 for never."""
+    """The newest of each message; times are the bridge's, us."""
 
     def __init__(self, origin: OriginSettings) -> None:
         self._fleet_origin = origin
-        self.heartbeat_utime = 0
+        self.heartbeat_utime: int | None = None
         self.text = ""  # the last warning that the autopilot sent, for people
         self.forget()
 
@@ -38,7 +39,7 @@ class Telemetry:
         self.armed = False
         self.roll_rad = self.pitch_rad = self.yaw_rad = 0.0
         self.battery = 0.0
-        self.position_utime = 0
+        self.position_utime: int | None = None
         self._landed_state = mavlink.MAV_LANDED_STATE_UNDEFINED
         self._local: Vector = (0.0, 0.0, 0.0)
         self.velocity: Vector = (0.0, 0.0, 0.0)
@@ -63,12 +64,13 @@ class Telemetry:
 
     def position_ok(self, utime: int) -> bool:
         """Whether position and origin are known, and fresh."""
-        fresh = self.position_utime > 0 and utime - self.position_utime <= POSITION_FRESH_US
-        return self._offset is not None and fresh
+        if self._offset is None or self.position_utime is None:
+            return False
+        return utime - self.position_utime <= POSITION_FRESH_US
 
     def link_ok(self, utime: int) -> bool:
         """Whether the autopilot was heard lately."""
-        return self.heartbeat_utime > 0 and utime - self.heartbeat_utime <= LINK_LOST_US
+        return self.heartbeat_utime is not None and utime - self.heartbeat_utime <= LINK_LOST_US
 
     def hear(self, message: Any, utime: int) -> bool:
         """Take in one message; True where it shows a new link or a restarted autopilot."""
@@ -88,7 +90,7 @@ class Telemetry:
             self._boot_ms = message.time_boot_ms
             if kind == "ATTITUDE":
                 self.roll_rad, self.pitch_rad, self.yaw_rad = message.roll, message.pitch, message.yaw
-            else:
+            elif math.isfinite(sum((message.x, message.y, message.z, message.vx, message.vy, message.vz))):
                 self._local = (message.x, message.y, message.z)
                 self.velocity = (message.vx, message.vy, message.vz)
                 self.position_utime = utime

@@ -18,6 +18,7 @@ TWIN_US = 20_000
 BRIDGE_US = 50_000
 HOME = (10.0, 20.0)
 DRONE_ID = 1
+CALM = Wind()
 ORIGIN = (15.30, -61.50, 0.0)
 
 
@@ -25,7 +26,7 @@ class Rig:
     """A bridge and a twin; `want` is said 10 times a second while it is set."""
 
     def __init__(
-        self, *, gps_noise_m: float = 0.0, compass_error_deg: float = 0.0, wind: Wind = Wind()
+        self, *, gps_noise_m: float = 0.0, compass_error_deg: float = 0.0, wind: Wind = CALM
     ) -> None:
         self.utime = 5_000_000
         self.mission = Mission()
@@ -334,7 +335,7 @@ def test_a_setpoint_with_no_number_or_for_another_drone_is_refused(flying):
     flying.say(kind=99)
     other = make(setpoint_t, utime=flying.utime, drone_id=2, expiry_utime=flying.utime + 10**6)
     flying.bridge.setpoint(other, flying.utime)
-    assert flying.bridge.n_refused == 3
+    assert flying.bridge.flyer.n_refused == 3
     assert flying.sent == []
 
 
