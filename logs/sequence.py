@@ -8,7 +8,8 @@ from logs.schemas import fingerprint
 
 __all__ = ["GapCounter", "Head", "read_head"]
 
-HEAD = struct.Struct(">8sqib")  # fingerprint, int64 utime, int32 seq, int8 drone_id
+HEAD = struct.Struct(">8sqi")  # fingerprint, int64 utime, int32 seq
+PROCESS_OFFSET = HEAD.size + 1  # of the process's name in a heartbeat, behind int8 drone_id
 STRING_LENGTH = struct.Struct(">i")
 HEARTBEAT = fingerprint(podwatch.heartbeat_t)
 
@@ -19,7 +20,6 @@ class Head(NamedTuple):
     fingerprint: bytes
     utime: int
     seq: int
-    drone_id: int
 
 
 def read_head(channel: str, data: bytes) -> Head | None:
@@ -65,9 +65,9 @@ class GapCounter:
 
 
 def _process_name(heartbeat: bytes) -> bytes:
-    """The `process` member of an encoded heartbeat: an LCM string follows the head."""
-    start = HEAD.size + STRING_LENGTH.size
+    """The `process` member of an encoded heartbeat: an LCM string."""
+    start = PROCESS_OFFSET + STRING_LENGTH.size
     if len(heartbeat) < start:
         return b""
-    (length,) = STRING_LENGTH.unpack_from(heartbeat, HEAD.size)
+    (length,) = STRING_LENGTH.unpack_from(heartbeat, PROCESS_OFFSET)
     return heartbeat[start : start + max(length, 0)]

@@ -21,7 +21,7 @@ from logs.writer import LogWriter, fresh_path
 
 LCM_GEN = Path(lcm.__file__).parent.parent / "bin" / "lcm-gen"
 SECOND_US = 1_000_000
-KINDS = sorted({channel.kind for channel in channels.CHANNELS}, key=lambda kind: kind.__name__)
+KINDS = sorted({channel.kind for channel in channels.BY_NAME.values()}, key=lambda kind: kind.__name__)
 
 
 def state(seq: int, utime: int | None = None) -> podwatch.vehicle_state_t:
@@ -99,10 +99,8 @@ def test_an_mcap_reader_finds_schema_fingerprint_drone_and_seq(tmp_path):
 
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.__name__)
 def test_lcm_gen_rebuilds_each_decoder_from_the_logs_schema_alone(tmp_path, monkeypatch, kind):
-    name = next(channel.name for channel in channels.CHANNELS if channel.kind is kind)
-    message = (
-        filled_fleet_state() if kind is podwatch.fleet_state_t else make(kind, utime=5, seq=9, drone_id=2)
-    )
+    name = next(channel.name for channel in channels.BY_NAME.values() if channel.kind is kind)
+    message = filled_fleet_state() if kind is podwatch.fleet_state_t else make(kind, utime=5, seq=9)
     path = write(tmp_path / "a.mcap", [(name, message.encode(), 5)])
     with path.open("rb") as file:
         [(schema, _, logged)] = make_reader(file).iter_messages()
@@ -131,10 +129,10 @@ def test_a_schema_says_its_package_once_and_nested_structs_first():
 
 def test_every_channels_type_begins_with_the_head_that_gaps_are_read_from():
     for kind in KINDS:
-        assert kind.__slots__[:3] == ["utime", "seq", "drone_id"], kind
-        assert kind.__typenames__[:3] == ["int64_t", "int32_t", "int8_t"], kind
-    assert podwatch.heartbeat_t.__slots__[3] == "process"
-    assert podwatch.heartbeat_t.__typenames__[3] == "string"
+        assert kind.__slots__[:2] == ["utime", "seq"], kind
+        assert kind.__typenames__[:2] == ["int64_t", "int32_t"], kind
+    assert podwatch.heartbeat_t.__slots__[2:4] == ["drone_id", "process"]
+    assert podwatch.heartbeat_t.__typenames__[2:4] == ["int8_t", "string"]
 
 
 WRITE_A_LOG = """
