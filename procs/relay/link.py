@@ -44,6 +44,7 @@ class Link:
     heard_us: int | None = None  # when a datagram came last
     heard_by_peer_us: int | None = None  # when the peer last said that it hears us
     peer_stamp_us: int = 0  # of the datagram heard last, peer's clock
+    is_knocking: bool = False  # the peer calls in a session that it has not proven: it needs our challenge
     n_rejected: int = 0
     n_unsent: int = 0  # datagrams that the radio did not take
 

@@ -132,8 +132,13 @@ class Relay:
         living = self.members.living(now_us)
         self.fleet_clock.update(living, {peer_id: link.clock for peer_id, link in self.links.items()}, now_us)
         has_table = self.fleet.is_windowed or self._n_ticks % TICKS_PER_TABLE == 0
-        for peer_id in self._spoken_to(now_us):
-            self._send_own(self.links[peer_id], has_table, now_us)
+        spoken_to = self._spoken_to(now_us)
+        for peer_id, link in self.links.items():
+            if peer_id in spoken_to:
+                self._send_own(link, has_table, now_us)
+            elif link.is_knocking:
+                self._send_own(link, False, now_us)
+            link.is_knocking = False
         if self._n_ticks % TICKS_PER_HELLO == 0:
             called = self._called(now_us)
             for k in range(min(HELLOS, len(called))):
@@ -292,6 +297,7 @@ class Relay:
         self.refused[reason] = self.refused.get(reason, 0) + 1
         if sender in self.links:
             self.links[sender].n_rejected += 1
+            self.links[sender].is_knocking |= reason is Refusal.UNPROVEN
 
 
 def _decode(channel: Channel, data: bytes) -> Any:
