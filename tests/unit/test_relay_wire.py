@@ -1,5 +1,7 @@
 """Each wire format of the relay: what is packed comes back, what is cut or wrong is refused."""
 
+import contextlib
+
 import pytest
 from hypothesis import assume, given
 from hypothesis import settings as cases
@@ -10,7 +12,6 @@ from procs.relay.clock_sync import FleetOffer
 from procs.relay.datagram import Body, ClockPart, DatagramError, MessagePart
 from procs.relay.fleet import TABLE_LIMIT_BYTES, FleetTable, Order
 from procs.relay.rows import Marker, Row, RowError, pack_row, position_unit_m, unpack_row, with_age
-import contextlib
 
 int64 = st.integers(-(2**63), 2**63 - 1)
 offers = st.builds(FleetOffer, int64, st.integers(0, 255), st.integers(0, 255))
