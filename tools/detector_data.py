@@ -1,11 +1,13 @@
-"""What the detector learns from: rendered scenes kept in a cache, photographs cut, mosaicked and pasted, and noise.
+"""What the detector learns from: rendered scenes kept in a cache, photographs cut, mosaicked and pasted, and
+noise.
 
-A sample is an RGB-ready BGR image and its boxes (N, 5): xyxy px and 1 where the box counts, 0 where the animal is too
-faint or too far outside to be learnt either way.
+A sample is an RGB-ready BGR image and its boxes (N, 5): xyxy px and 1 where the box counts, 0 where the
+animal is too faint or too far outside to be learnt either way.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -99,7 +101,7 @@ def _with_halves(image: Image, boxes: Boxes, levels: int = 4) -> Sample:
     if levels == 0:
         return Sample(image, boxes)
     half = np.asarray(cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), np.uint8)
-    return Sample(image, boxes, _with_halves(half, boxes * np.float32([0.5, 0.5, 0.5, 0.5, 1]), levels - 1))
+    return Sample(image, boxes, _with_halves(half, boxes * _row([0.5, 0.5, 0.5, 0.5, 1]), levels - 1))
 
 
 def _reduced(sample: Sample, scale: float) -> Sample:
@@ -109,14 +111,18 @@ def _reduced(sample: Sample, scale: float) -> Sample:
     return sample
 
 
+def _row(values: list[float]) -> Boxes:
+    return np.array(values, np.float32)
+
+
 def _place(sample: Sample, canvas: Image, scale: float, shift: tuple[float, float]) -> Boxes:
-    """Draw the picture at `scale` with its corner at `shift` (u, v) onto the canvas; its boxes there, clipped."""
+    """Draw the picture at `scale` with its corner at `shift` (u, v) onto the canvas; its boxes there,
+    clipped.
+    """
     height, width = canvas.shape[:2]
     move = np.array([[scale, 0, shift[0]], [0, scale, shift[1]]])
     cv2.warpAffine(sample.image, move, (width, height), dst=canvas, borderMode=cv2.BORDER_TRANSPARENT)
-    return _clipped(
-        sample.boxes * np.float32([scale] * 4 + [1]) + np.float32([*shift, *shift, 0]), (0, 0, width, height)
-    )
+    return _clipped(sample.boxes * _row([scale] * 4 + [1]) + _row([*shift, *shift, 0]), (0, 0, width, height))
 
 
 def _clipped(boxes: Boxes, window: tuple[int, int, int, int]) -> Boxes:
@@ -161,7 +167,8 @@ def scene_sample(scene: Sample, rng: np.random.Generator, side: int) -> Sample:
 def _window(
     photo: Sample, rng: np.random.Generator, size: tuple[int, int], animal_px: float | None
 ) -> Sample:
-    """A (width, height) window of a photograph in which its animal is about `animal_px` long, or has none (None).
+    """A (width, height) window of a photograph in which its animal is about `animal_px` long, or has none
+    (None).
 
     The window is always full: where the photograph would be too small it is shown larger.
     """
@@ -177,9 +184,7 @@ def _window(
     shift = rng.uniform(0, 1, 2) * room
     if box is not None:
         for _ in range(12):
-            shown = _clipped(
-                box[None] * np.float32([scale] * 4 + [1]) + np.float32([*shift, *shift, 0]), (0, 0, *size)
-            )
+            shown = _clipped(box[None] * _row([scale] * 4 + [1]) + _row([*shift, *shift, 0]), (0, 0, *size))
             if (animal_px is None and len(shown) == 0) or (animal_px is not None and shown[:, 4].any()):
                 break
             shift = rng.uniform(0, 1, 2) * room
@@ -211,8 +216,8 @@ def _mosaic(photos: Sequence[Sample], rng: np.random.Generator, side: int) -> Sa
         ]
         for n in rng.integers(2, 5, 2).tolist()
     )
-    for left, right in zip(columns, columns[1:], strict=False):
-        for top, bottom in zip(rows, rows[1:], strict=False):
+    for left, right in pairwise(columns):
+        for top, bottom in pairwise(rows):
             photo = photos[int(rng.integers(len(photos)))]
             animal_px = (
                 None
@@ -221,12 +226,12 @@ def _mosaic(photos: Sequence[Sample], rng: np.random.Generator, side: int) -> Sa
             )
             window = _window(photo, rng, (right - left, bottom - top), animal_px)
             canvas[top:bottom, left:right] = window.image
-            boxes.append(window.boxes + np.float32([left, top, left, top, 0]))
+            boxes.append(window.boxes + _row([left, top, left, top, 0]))
     return Sample(canvas, np.concatenate(boxes))
 
 
 def _pasted(photos: Sequence[Sample], seas: Sequence[Sample], rng: np.random.Generator, side: int) -> Sample:
-    """One to nine animals cut from photographs, feathered onto one sea without animals: a pod that never was."""
+    """One to nine animals cut from photographs, feathered onto one empty sea: a pod that never was."""
     if seas and rng.random() < 0.5:
         canvas = scene_sample(
             Sample(seas[int(rng.integers(len(seas)))].image, np.zeros((0, 5), np.float32)), rng, side
@@ -252,7 +257,7 @@ def _pasted(photos: Sequence[Sample], seas: Sequence[Sample], rng: np.random.Gen
         if size[0] >= side or size[1] >= side:
             continue
         u, v = int(rng.integers(0, side - size[0])), int(rng.integers(0, side - size[1]))
-        box = (photo.boxes[0, :4] - np.float32([left, top, left, top])) * np.float32(scale) + np.float32(
+        box = (photo.boxes[0, :4] - _row([left, top, left, top])) * np.float32(scale) + np.float32(
             [u, v, u, v]
         )
         if any(_overlap(box, other) > 0.02 for other in boxes[:, :4]):
@@ -298,7 +303,9 @@ def photograph_sample(
 
 
 def letterboxed(sample: Sample, rng: np.random.Generator) -> Sample:
-    """Grey bars above and below, as the detector gets a camera's wide picture; done last, the bars never vary."""
+    """Grey bars above and below, as the detector gets a camera's wide picture; done last, the bars never
+    vary.
+    """
     height = sample.image.shape[0]
     bar = int(height * rng.uniform(0.1, 0.2))
     image = sample.image.copy()

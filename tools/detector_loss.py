@@ -33,8 +33,9 @@ def assign(
 ) -> tuple[Tensor, Tensor]:
     """For one image: the animal of each cell (A,), -1 for none, and the score that the cell should give (A,).
 
-    scores (A,) in 0-1 and boxes (A, 4) px as predicted, animals (N, 4) px. The cells inside an animal whose own boxes
-    fit it best answer for it (task-aligned assignment, Feng et al. 2021); the best of them should say its own IoU.
+    scores (A,) in 0-1 and boxes (A, 4) px as predicted, animals (N, 4) px. The cells inside an animal whose
+    own boxes fit it best answer for it (task-aligned assignment, Feng et al. 2021); the best of them should
+    say its own IoU.
     """
     owner = torch.full(scores.shape, -1, dtype=torch.long)
     target = torch.zeros_like(scores)

@@ -1,9 +1,9 @@
 """The detector's network: a small fully convolutional, anchor-free, one-stage detector.
 
-Our own design, for one thread of a small computer: a quarter of a million parameters, 320x320 in some milliseconds.
-Every cell of three grids (8, 16 and 32 px apart) says how likely a whale is there and how far the box's four sides
-lie from the cell's centre, in units of the grid (FCOS, Tian et al. 2019). Written on plain torch; nothing here is
-taken from an AGPL package.
+Our own design, for one thread of a small computer: a quarter of a million parameters, 320x320 in some
+milliseconds. Every cell of three grids (8, 16 and 32 px apart) says how likely a whale is there and how far
+the box's four sides lie from the cell's centre, in units of the grid (FCOS, Tian et al. 2019). Written on
+plain torch; nothing here is taken from an AGPL package.
 """
 
 from dataclasses import dataclass
@@ -43,7 +43,9 @@ class ConvUnit(nn.Sequential):
 
 
 class SplitBlock(nn.Module):
-    """Half of the channels pass through two 3x3 convolutions, half pass by: a quarter of the cost of a full block."""
+    """Half of the channels pass through two 3x3 convolutions, half pass by: a quarter of the cost of a full
+    block.
+    """
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -135,7 +137,7 @@ def decode(distances: Tensor, centres: Tensor, strides: Tensor) -> Tensor:
 
 
 class Exported(nn.Module):
-    """The network with the Ultralytics raw layout: (B, 4 + nc, A) of cx, cy, w, h in px, then scores in 0-1."""
+    """The network in the Ultralytics raw layout: (B, 4 + nc, A) of cx, cy, w, h px, then scores 0-1."""
 
     def __init__(self, network: WhaleDetector, side: int) -> None:
         super().__init__()

@@ -1,4 +1,5 @@
-"""Renders labelled scenes: seas with whales, lawns with whale posters, and empty ones, in the standard YOLO layout.
+"""Renders labelled scenes: seas with whales, lawns with whale posters, and empty ones, in the standard YOLO
+layout.
 
 The trainer and the tests draw from the same scenes; a scene depends on (seed, index, split) alone.
 """
@@ -49,7 +50,9 @@ class Scene:
 
 
 def _pod(rng: np.random.Generator, species: tuple[str, ...], extent_m: float, kind: str) -> list[AnimalView]:
-    """Between no and ten animals round the origin; most pods are of one species, all swimming roughly one way."""
+    """Between no and ten animals round the origin; most pods are of one species, all swimming roughly one
+    way.
+    """
     if not species or rng.random() < 0.08:
         return []
     name = str(rng.choice(species))
@@ -68,13 +71,14 @@ def _pod(rng: np.random.Generator, species: tuple[str, ...], extent_m: float, ki
         phase = np.pi / 2 * int(rng.integers(4))  # four of the strokes: each picture takes 20 ms to draw
         animals.append(
             AnimalView(
-                identity,
-                *place.tolist(),
-                heading + turn,
-                length_m,
-                name,
-                depth_m,
-                phase,
+                id=identity,
+                n_m=float(place[0]),
+                e_m=float(place[1]),
+                heading_rad=heading + turn,
+                length_m=length_m,
+                species=name,
+                depth_m=depth_m,
+                phase_rad=phase,
                 poster=kind == "grass",
             )
         )
@@ -86,11 +90,9 @@ def _view(rng: np.random.Generator, length_m: float, side: tuple[int, int]) -> t
     length_px = float(np.exp(rng.uniform(np.log(14), np.log(230)))) * max(side) / 384
     camera = Pinhole(side, float(rng.uniform(0.7, 1.3)))
     height_m = length_m * camera.focal_px / length_px
-    tilt = rng.normal(0, 0.12, 2)
-    offset = rng.uniform(-0.1, 0.1, 2) * height_m
-    pose = Pose(
-        *offset.tolist(), -height_m, *np.clip(tilt, -0.4, 0.4).tolist(), float(rng.uniform(-np.pi, np.pi))
-    )
+    roll, pitch = np.clip(rng.normal(0, 0.12, 2), -0.4, 0.4).tolist()
+    north_m, east_m = (rng.uniform(-0.1, 0.1, 2) * height_m).tolist()
+    pose = Pose(north_m, east_m, -height_m, roll, pitch, float(rng.uniform(-np.pi, np.pi)))
     return camera, pose, length_px
 
 
@@ -101,7 +103,7 @@ def scenes(
     side: tuple[int, int] = (384, 384),
     shapes: list[Species] | None = None,
 ) -> Iterator[Scene]:
-    """`count` scenes of `split`, `side` (width, height) px; `shapes` are right whales measured from outlines."""
+    """`count` scenes of `split`, `side` (width, height) px; `shapes` are measured right whales."""
     if split not in SPLITS:
         raise ValueError(f"split {split!r} is not known; there are: {', '.join(SPLITS)}")
     renderer, kind, species = SeaRenderer(0, species=(), sea_state=0), "sea", SPLITS[split]
@@ -150,10 +152,11 @@ def _scene(
 
 
 def measured_right_whales(outlines_csv: Path, count: int = 40) -> list[Species]:
-    """Right whales with the widths of real ones, from the table of outlines in ../shared/data; empty if it is missing.
+    """Right whales with the widths of real ones, from the table of outlines in ../shared/data; empty if it is
+    missing.
 
-    The table gives rostrum, peduncle and the two sides' points in pixels; the width at a station is the distance
-    between the sides there, in shares of the distance from rostrum to fluke notch.
+    The table gives rostrum, peduncle and the two sides' points in pixels; the width at a station is the
+    distance between the sides there, in shares of the distance from rostrum to fluke notch.
     """
     if not outlines_csv.is_file():
         return []
@@ -183,10 +186,11 @@ def measured_right_whales(outlines_csv: Path, count: int = 40) -> list[Species]:
 def render_dataset(
     out: Path, n: int, seed: int, split: str = "train", side: tuple[int, int] = (640, 480)
 ) -> Path:
-    """Write `n` scenes to `out` as images/<split>/, labels/<split>/ (YOLO text), truth/<split>/ (JSON) and data.yaml.
+    """Write `n` scenes to `out` as images/<split>/, labels/<split>/ (YOLO text), truth/<split>/ (JSON) and
+    data.yaml.
 
-    The JSON holds ids and boxes in px, boxes of animals too faint to count, and the 3x3 homography from pixels to
-    ground metres. Returns the path of data.yaml. Raises ValueError for a bad split or count.
+    The JSON holds ids and boxes in px, boxes of animals too faint to count, and the 3x3 homography from
+    pixels to ground metres. Returns the path of data.yaml. Raises ValueError for a bad split or count.
     """
     if n < 1:
         raise ValueError(f"n {n}: at least one scene must be asked for")

@@ -1,4 +1,6 @@
-"""From a detection network's output to boxes: the layouts that exported ONNX files come in (DESIGN section 7)."""
+"""From a detection network's output to boxes: the layouts that exported ONNX files come in (DESIGN section
+7).
+"""
 
 from collections.abc import Sequence
 from typing import Literal, NamedTuple
@@ -24,14 +26,18 @@ class Candidates(NamedTuple):
     scores: NDArray[np.float32]  # (N,)
     classes: NDArray[np.int64]  # (N,)
 
+    def take(self, rows: NDArray[np.bool_] | NDArray[np.int64]) -> "Candidates":
+        """Those of `rows`, a mask or indices."""
+        return Candidates(self.boxes[rows], self.scores[rows], self.classes[rows])
+
 
 def layout_of(
     shape: Sequence[int], class_count: int | None, task: str = "detect"
 ) -> Literal["raw", "finished"]:
     """Which layout an output of `shape` has; ValueError names the shape when it is neither.
 
-    raw: (1, 4 + nc, A), one more row for the angle of an oriented box. finished: (1, N, 6), or 7 with an angle. The
-    finished one is tried first: no network has 6 or 7 cells, but many have two or three classes.
+    raw: (1, 4 + nc, A), one more row for the angle of an oriented box. finished: (1, N, 6), or 7 with an
+    angle. The finished one is tried first: no network has 6 or 7 cells, but many have two or three classes.
     """
     extra = 1 if task == "obb" else 0
     if len(shape) == 3 and shape[0] == 1:
@@ -59,9 +65,9 @@ def _finite(candidates: Candidates, total: int) -> Candidates:
     refused = int(len(good) - good.sum())
     if refused > MOST_REFUSED_SHARE * max(total, 1):
         raise ModelError(
-            f"{refused} of {total} rows of the model's output are NaN or infinite: export the model again, in float32"
+            f"{refused} of {total} rows of the output are NaN or infinite; export the model again, in float32"
         )
-    return Candidates(*(column[good] for column in candidates))
+    return candidates.take(good)
 
 
 def decode_raw(output: NDArray[np.float32], confidence: float, task: str = "detect") -> Candidates:
@@ -101,4 +107,4 @@ def suppress(candidates: Candidates, confidence: float, iou: float) -> Candidate
     )
     order = np.asarray(kept, np.int64).reshape(-1)
     order = order[np.argsort(-candidates.scores[order], kind="stable")][:MOST_BOXES]
-    return Candidates(*(column[order] for column in candidates))
+    return candidates.take(order)

@@ -26,7 +26,9 @@ def _starts(length: int, tile: int) -> list[int]:
 def tile_windows(
     size: tuple[int, int], tile: int | Literal["auto"] | None, input_size: tuple[int, int]
 ) -> list[tuple[int, int, int, int]]:
-    """Windows (left, top, right, bottom) px to look at beside the whole picture of `size`; none for small pictures."""
+    """Windows (left, top, right, bottom) px to look at beside the whole picture of `size`; none for small
+    pictures.
+    """
     width, height = size
     if tile is None:
         return []
@@ -45,7 +47,8 @@ def tile_windows(
 
 
 def drop_cut(found: Candidates, window: tuple[int, int, int, int], size: tuple[int, int]) -> Candidates:
-    """Without boxes that touch a seam inside the picture: a neighbouring tile or the whole view has them uncut.
+    """Without boxes that touch a seam inside the picture: a neighbouring tile or the whole view has them
+    uncut.
 
     Boxes are in the window's own pixels.
     """
@@ -58,4 +61,4 @@ def drop_cut(found: Candidates, window: tuple[int, int, int, int], size: tuple[i
         ]
     )
     whole = np.all(found.boxes[:, :2] >= low, axis=1) & np.all(found.boxes[:, 2:] <= high, axis=1)
-    return Candidates(*(column[whole] for column in found))
+    return found.take(whole)

@@ -48,11 +48,13 @@ class Detections:
 class Detector:
     """One network, loaded once; `detect` may be called for any number of pictures of any size.
 
-    model_path: an ONNX file, None for the one that ships. confidence: least score. iou: overlap above which the lesser of two
-    boxes goes. classes: numbers of the classes to report, None for all. tile: None looks at the whole picture once;
-    a number also looks at overlapping tiles of that many px, "auto" chooses that by the picture's size.
+    model_path: an ONNX file, None for the one that ships. confidence: least score. iou: overlap above which
+    the lesser of two boxes goes. classes: numbers of the classes to report, None for all. tile: None looks at
+    the whole picture once; a number also looks at overlapping tiles of that many px, "auto" chooses that by
+    the picture's size.
 
-    Raises ModelError when the file is missing, empty, broken or of another layout; ValueError for bad settings.
+    Raises ModelError when the file is missing, empty, broken or of another layout; ValueError for bad
+    settings.
     """
 
     def __init__(
@@ -81,14 +83,15 @@ class Detector:
         self._classes = None if classes is None else np.array(sorted(classes), np.int64)
         self.input_size = self._read_input()
         self._canvas = np.full((self.input_size[1], self.input_size[0], 3), PAD_GREY, np.uint8)
-        # Run once: the layout of a dynamic export shows only now, and the first picture is not slower than the rest.
+        # Run once: the layout of a dynamic export shows only now, and the first picture is not slower than
+        # the rest.
         blank = np.zeros((1, 3, self.input_size[1], self.input_size[0]), self._dtype)
         try:
             output = self._run(blank)
             self._layout = layout_of(output.shape, len(self.names) or None, self._task)
         except ValueError as error:
             raise ModelError(
-                f"{self._path}: {error} (metadata: {self._metadata or 'none'}); export it as ONNX for detection"
+                f"{self._path}: {error}; metadata: {self._metadata or 'none'}; export it for detection"
             ) from error
         if not self.names and self._layout == "raw":
             self.names = {
@@ -111,11 +114,15 @@ class Detector:
         for left, top, right, bottom in tile_windows((width, height), self._tile, self.input_size):
             piece = self._look(image_bgr[top:bottom, left:right], timings)
             piece = drop_cut(piece, (left, top, right, bottom), (width, height))
-            found.append(piece._replace(boxes=piece.boxes + np.float32([left, top, left, top])))
+            found.append(piece._replace(boxes=piece.boxes + _row(left, top, left, top)))
         begun = time.perf_counter()
-        merged = Candidates(*(np.concatenate(columns) for columns in zip(*found, strict=True)))
+        merged = Candidates(
+            np.concatenate([look.boxes for look in found]),
+            np.concatenate([look.scores for look in found]),
+            np.concatenate([look.classes for look in found]),
+        )
         kept = suppress(merged, self._confidence, self._iou)
-        boxes = np.clip(kept.boxes, 0, np.float32([width, height, width, height])).astype(np.float32)
+        boxes = np.clip(kept.boxes, 0, _row(width, height, width, height)).astype(np.float32)
         real = np.all(boxes[:, 2:] > boxes[:, :2], axis=1)
         timings["decode"] += (time.perf_counter() - begun) * 1e3
         return Detections(
@@ -140,13 +147,15 @@ class Detector:
         except ModelError as error:
             raise ModelError(f"{self._path}: {error}") from error
         if self._classes is not None:
-            found = Candidates(*(column[np.isin(found.classes, self._classes)] for column in found))
-        boxes = (found.boxes - np.float32([left, top, left, top])) / np.float32(scale)
+            found = found.take(np.isin(found.classes, self._classes))
+        boxes = (found.boxes - _row(left, top, left, top)) / np.float32(scale)
         timings["decode"] += (time.perf_counter() - inferred) * 1e3
         return found._replace(boxes=boxes)
 
     def _prepare(self, image: Image) -> tuple[NDArray[np.generic] | None, float, int, int]:
-        """(tensor (1, 3, H, W) RGB 0-1, scale, left, top) of the letterboxed picture; no tensor where it is flat."""
+        """(tensor (1, 3, H, W) RGB 0-1, scale, left, top) of the letterboxed picture; no tensor where it is
+        flat.
+        """
         width, height = self.input_size
         scale = min(width / image.shape[1], height / image.shape[0])
         size = (max(round(image.shape[1] * scale), 1), max(round(image.shape[0] * scale), 1))
@@ -193,7 +202,7 @@ class Detector:
         if len(inputs) != 1 or inputs[0].type not in types or len(shape) != 4 or shape[1] not in (3, "3"):
             described = ", ".join(f"{item.name} {item.type} {item.shape}" for item in inputs)
             raise ModelError(
-                f"{self._path}: the model's input is {described}; one of float (1, 3, height, width) is needed"
+                f"{self._path}: the model's input is {described}; float (1, 3, height, width) is needed"
             )
         self._dtype = types[inputs[0].type]
         sides = shape[2:]
@@ -205,9 +214,13 @@ class Detector:
                 sides = [int(side) for side in (said if isinstance(said, (list, tuple)) else (said, said))]
             except (ValueError, SyntaxError, TypeError) as error:
                 raise ModelError(
-                    f"{self._path}: metadata imgsz is {self._metadata['imgsz']!r}, not [height, width]; export it again"
+                    f"{self._path}: metadata imgsz {self._metadata['imgsz']!r} is not [height, width]; export it again"
                 ) from error
         return int(sides[1]), int(sides[0])
+
+
+def _row(*values: float) -> NDArray[np.float32]:
+    return np.array(values, np.float32)
 
 
 def _model_file(model_path: str | Path | None) -> Path:

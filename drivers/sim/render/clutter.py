@@ -1,4 +1,6 @@
-"""Things on the water that are no whales: boats, birds, buoys, foam patches, spouts, glare. For training alone."""
+"""Things on the water that are no whales: boats, birds, buoys, foam patches, spouts, glare. For training
+alone.
+"""
 
 import cv2
 import numpy as np
@@ -60,11 +62,8 @@ def _boat(rng: np.random.Generator, length: int) -> tuple[NDArray[np.float32], N
         )
     turn = cv2.getRotationMatrix2D((float(middle[0]), float(middle[1])), float(rng.uniform(0, 360)), 1.0)
     both = np.maximum(hull, cv2.GaussianBlur(wake, (0, 0), max(length / 14, 0.6)))
-    turned = (
-        cv2.warpAffine(layer, turn, (side, side)).astype(np.float32) / 255 for layer in (both, fittings)
-    )
-    hull_share, fittings_share = turned
-    return hull_share, fittings_share
+    turned = [np.asarray(cv2.warpAffine(each, turn, (side, side)), np.float32) for each in (both, fittings)]
+    return turned[0] / np.float32(255), turned[1] / np.float32(255)
 
 
 def add_clutter(image: Image, rng: np.random.Generator, length_px: float, on_water: bool = True) -> None:
@@ -102,7 +101,7 @@ def add_clutter(image: Image, rng: np.random.Generator, length_px: float, on_wat
             angle = rng.uniform(0, 2 * np.pi)
             wing = span / 2 * np.array([np.cos(angle), np.sin(angle)])
             back = span * 0.2 * np.array([-np.sin(angle), np.cos(angle)])
-            points = np.array([(u, v) - wing + back, (u, v), (u, v) + wing + back])
+            points = np.array([back - wing, np.zeros(2), back + wing]) + (u, v)
             tone = int(rng.choice([245, 235, 60]))
             thick = max(int(span / 7), 1)
             cv2.polylines(

@@ -53,7 +53,9 @@ def body_to_ground(animal: AnimalView) -> Array:
 
 
 def _clip_polygon(points: Array, width: float, height: float) -> Array:
-    """The part of a polygon (N, 2) inside the image, (M, 2) with M = 0 for none (Sutherland and Hodgman 1974)."""
+    """The part of a polygon (N, 2) inside the image, (M, 2) with M = 0 for none (Sutherland and Hodgman
+    1974).
+    """
     for axis, limit, side in ((0, 0.0, 1.0), (0, width, -1.0), (1, 0.0, 1.0), (1, height, -1.0)):
         if len(points) == 0:
             break
@@ -84,8 +86,8 @@ def label_animals(
 ) -> Labels:
     """The animals of which anything shows in the view, in the order given.
 
-    The box is the smallest upright rectangle round the part of the projected outline that lies inside the image.
-    Raises ValueError when a species is not known.
+    The box is the smallest upright rectangle round the part of the projected outline that lies inside the
+    image. Raises ValueError when a species is not known.
     """
     to_image = camera.ground_to_image(pose)
     width, height = camera.image_size

@@ -20,9 +20,11 @@ MATCHES_NEEDED = 20  # fewer matched points than this say nothing about how the 
 
 
 class PictureSurface:
-    """A photograph that covers `width_m` metres from left to right, its middle at `centre_ne`, its top to the north.
+    """A photograph that covers `width_m` metres from left to right, its middle at `centre_ne`, its top to the
+    north.
 
-    Outside the picture lies flat sea of its median colour; nothing is mirrored or repeated, so no animal shows twice.
+    Outside the picture lies flat sea of its median colour; nothing is mirrored or repeated, so no animal
+    shows twice.
     """
 
     def __init__(self, image_bgr: Image, width_m: float, centre_ne: tuple[float, float] = (0.0, 0.0)) -> None:
@@ -44,7 +46,7 @@ class PictureSurface:
     @property
     def metres_per_px(self) -> float:
         """Ground sample distance of the picture."""
-        return self.width_m / self._levels[0].shape[1]
+        return float(self.width_m / self._levels[0].shape[1])
 
     def picture_to_ground(self) -> Array:
         """(3, 3) from the picture's pixels (u, v, 1) to ground (n, e, 1) in metres."""
@@ -63,7 +65,9 @@ class PictureSurface:
         animals: Sequence[AnimalView] = (),
         out: Image | None = None,
     ) -> Image:
-        """The camera's view, (H, W, 3) uint8 BGR. `t_s` and `animals` change nothing: the animals are in the picture."""
+        """The camera's view, (H, W, 3) uint8 BGR. `t_s` and `animals` change nothing: the animals are in the
+        picture.
+        """
         to_picture = np.linalg.inv(self.picture_to_ground()) @ camera.image_to_ground(pose)
         # Pixel centres lie half a pixel inside, on both sides.
         half = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1.0]])
@@ -98,8 +102,8 @@ class PictureSurface:
 class VideoSurface(PictureSurface):
     """A video, each frame brought into the first one's place, played once from t_s = 0 and then frozen.
 
-    The camera that took it may drift: ORB points matched to the first frame give a homography. Where too few match
-    (open water without marks) the previous frame's place is kept.
+    The camera that took it may drift: ORB points matched to the first frame give a homography. Where too few
+    match (open water without marks) the previous frame's place is kept.
     """
 
     def __init__(self, path: Path, width_m: float, centre_ne: tuple[float, float] = (0.0, 0.0)) -> None:
@@ -111,7 +115,7 @@ class VideoSurface(PictureSurface):
         rate_hz = float(self._capture.get(cv2.CAP_PROP_FPS))
         self._rate_hz = rate_hz if 1.0 <= rate_hz <= 240.0 else 25.0
         self._index = 0
-        self._orb = cv2.ORB_create(1500)
+        self._orb = cv2.ORB.create(1500)
         self._matcher = cv2.BFMatcher(cv2.NORM_HAMMING, crossCheck=True)
         self._first_points = self._orb.detectAndCompute(cv2.cvtColor(first, cv2.COLOR_BGR2GRAY), None)
         self._to_first: Array = np.eye(3)
@@ -124,7 +128,9 @@ class VideoSurface(PictureSurface):
         animals: Sequence[AnimalView] = (),
         out: Image | None = None,
     ) -> Image:
-        """The camera's view of the frame shown at `t_s`; time only runs forward, an earlier `t_s` shows the newest."""
+        """The camera's view of the frame shown at `t_s`; time only runs forward, an earlier `t_s` shows the
+        newest.
+        """
         self._advance(int(max(t_s, 0.0) * self._rate_hz))
         return super().render(camera, pose, t_s, animals, out)
 
@@ -139,7 +145,7 @@ class VideoSurface(PictureSurface):
             self._index += 1
         if newest is None:
             return
-        self._to_first = self._place(newest)
+        self._to_first = self._place(np.asarray(newest, np.uint8))
         height, width = newest.shape[:2]
         steady = cv2.warpPerspective(
             newest,

@@ -1,12 +1,12 @@
 """Renders what a downward camera sees of a sea (or a lawn with whale posters) and of the animals in it.
 
-Cheap enough for the simulator, 20 views a second and drone on a share of one core, and varied enough to train the
-detector on. A view depends only on (seed, settings, camera, pose, t_s, animals).
+Cheap enough for the simulator, 20 views a second and drone on a share of one core, and varied enough to train
+the detector on. A view depends only on (seed, settings, camera, pose, t_s, animals).
 """
 
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import Literal
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -26,7 +26,8 @@ Array = NDArray[np.float64]
 INDIVIDUALS = 4  # differently marked pictures of a species; an animal's id picks one
 HAZE_BGR = (198, 190, 180)  # where the camera looks above the horizon
 
-# BGR of the water under an overcast sky, picked from aerial photographs by eye: troughs are darker, crests lighter.
+# BGR of the water under an overcast sky, picked from aerial photographs by eye: troughs are darker, crests
+# lighter.
 WATERS: dict[str, tuple[int, int, int]] = {
     "caribbean": (128, 82, 22),
     "deep": (98, 66, 34),
@@ -44,8 +45,9 @@ class SeaRenderer:
 
     seed: decides waves, water and the animals' markings.
     species: drawn ahead of time, so that the first view with one of them costs no more than the others.
-    sea_state: 0 (glass) to 5 (whitecaps everywhere). sun_elevation_rad, sun_azimuth_rad: where the glint comes from.
-    water: one of WATERS, or None for the seed's choice. shapes: replaces the proportions of a species by name.
+    sea_state: 0 (glass) to 5 (whitecaps everywhere). sun_elevation_rad, sun_azimuth_rad: where the glint
+    comes from. water: one of WATERS, or None for the seed's choice. shapes: replaces the proportions of a
+    species by name.
     """
 
     def __init__(
@@ -164,7 +166,8 @@ class SeaRenderer:
         ground = apply_homography(to_ground, np.stack([columns.ravel(), rows.ravel()], axis=-1))
         ray = np.column_stack([ground - (pose.n_m, pose.e_m), np.full(len(ground), pose.height_m)])
         ray /= np.linalg.norm(ray, axis=1, keepdims=True)
-        # The facet that would mirror the sun into the camera halves the angle between the sun and the way back.
+        # The facet that would mirror the sun into the camera halves the angle between the sun and the way
+        # back.
         facet = self._sun - ray
         facet /= np.linalg.norm(facet, axis=1, keepdims=True)
         tilt = np.arccos(np.clip(-facet[:, 2], -1, 1))
@@ -194,7 +197,7 @@ class SeaRenderer:
 
 @lru_cache(maxsize=2)
 def _cached_layers(seed: int, kind: str, sea_state: float) -> tuple[Layer, Layer]:
-    """Shared by all the cameras that one process simulates: each layer takes a fifth of a second and 14 MB."""
+    """Shared by all the cameras that one process simulates: a layer takes a fifth of a second, 14 MB."""
     rng = np.random.default_rng([seed, 1])
     return sea_layers(rng, sea_state) if kind == "sea" else grass_layers(rng)
 
@@ -243,7 +246,7 @@ def _blend(
     tint_bgr: Array | None = None,
     tint_share: float = 0.0,
 ) -> None:
-    """Draw the sprite over the part of `image` that it covers, its colours mixed with `tint_share` of a tint."""
+    """Draw the sprite over the part of `image` that it covers, `tint_share` of a tint mixed in."""
     height, width = image.shape[:2]
     corners = sprite.corners
     if np.any(corners @ body_to_image[2, :2] + body_to_image[2, 2] <= 1e-9):
@@ -260,16 +263,17 @@ def _blend(
     to_sprite = sprite.from_body(level) @ np.linalg.inv(body_to_image) @ offset
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     piece = cv2.warpPerspective(sprite.levels[level], to_sprite, (right - left, bottom - top), flags=flags)
-    # Colours come multiplied by their opacity, so mixing is linear: region * (1 - a) + ((1 - t) colour + t tint) a.
-    # Six OpenCV calls on bytes: 0.1 ms for a typical animal, a tenth of the same in numpy on floats.
+    # Colours come multiplied by their opacity, so mixing is linear: region * (1 - a) + ((1 - t) colour + t
+    # tint) a. Six OpenCV calls on bytes: 0.1 ms for a typical animal, a tenth of the same in numpy on floats.
     share = np.empty((*piece.shape[:2], 3), np.uint8)
     cv2.mixChannels([piece], [share], [3, 0, 3, 1, 3, 2])
     front = cv2.convertScaleAbs(cv2.cvtColor(piece, cv2.COLOR_BGRA2BGR), alpha=opacity * (1 - tint_share))
     if tint_bgr is not None:
-        blue, green, red = (float(value) for value in tint_bgr)
-        cv2.add(
-            front, cv2.multiply(share, (blue, green, red, 0.0), scale=opacity * tint_share / 255), dst=front
-        )
+        tint: Any = (
+            *tint_bgr.tolist(),
+            0.0,
+        )  # a scalar, one value a channel, where the type stubs know arrays alone
+        cv2.add(front, cv2.multiply(share, tint, scale=opacity * tint_share / 255), dst=front)
     region = image[top:bottom, left:right]
     behind = cv2.convertScaleAbs(share, alpha=-opacity, beta=255.0)
     cv2.add(cv2.multiply(region, behind, scale=1 / 255), front, dst=region)

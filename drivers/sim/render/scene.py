@@ -22,8 +22,9 @@ class SurfaceError(Exception):
 class AnimalView:
     """One animal at one instant, as a camera needs it: local NED metres, radians, 0 rad heading north.
 
-    `n_m`, `e_m` are the middle of the body; `depth_m` above 0 is under the surface, where the animal fades and is
-    invisible from about 4 m; `phase_rad` drives the tail; `poster` makes it a picture printed on a rectangular sheet.
+    `n_m`, `e_m` are the middle of the body; `depth_m` above 0 is under the surface, where the animal fades
+    and is invisible from about 4 m; `phase_rad` drives the tail; `poster` makes it a picture printed on a
+    rectangular sheet.
     """
 
     id: int

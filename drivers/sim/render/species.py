@@ -1,8 +1,9 @@
 """Proportions and colours of the animals, as a small table: all lengths are shares of the body length.
 
-The body runs from the tip of the snout (station 0) to the notch between the flukes (station 1). Widths were set from
-published photogrammetry and field guides; the minke's are the 19 widths that come with the photogrammetry example of
-MorphoMetriX. Training may replace the right whale's by measured outlines (tools/render.py).
+The body runs from the tip of the snout (station 0) to the notch between the flukes (station 1). Widths were
+set from published photogrammetry and field guides; the minke's are the 19 widths that come with the
+photogrammetry example of MorphoMetriX. Training may replace the right whale's by measured outlines
+(tools/render.py).
 """
 
 from dataclasses import dataclass, replace
@@ -84,7 +85,8 @@ SPECIES: dict[str, Species] = {
             *(0.24, 0.075, 0.07, 0.22, 0.1, 0.035, 0.74, 0.04),
             *((72, 72, 70), (140, 145, 145), 0.1, 0.05, 0.0, 18.0),
         ),
-        # Mottled grey, a row of knuckles in place of the dorsal fin. The trainer never draws it: a validation species.
+        # Mottled grey, a row of knuckles in place of the dorsal fin. The trainer never draws it: a validation
+        # species.
         Species(
             "gray",
             (0.025, 0.05, 0.075, 0.105, 0.15, 0.178, 0.185, 0.17, 0.138, 0.1, 0.065, 0.038, 0.034, 0.03),

@@ -1,4 +1,6 @@
-"""Animals as small pictures with transparency, drawn once per species, individual and phase of the tail's stroke."""
+"""Animals as small pictures with transparency, drawn once per species, individual and phase of the tail's
+stroke.
+"""
 
 from dataclasses import dataclass
 
@@ -40,13 +42,13 @@ class Sprite:
 
 
 def stroke_of(phase: int) -> tuple[float, float]:
-    """(bend, chord share) of stroke picture `phase` of PHASES: the tail beats up and down and yaws a little."""
+    """(bend, chord share) of stroke picture `phase` of PHASES: the tail beats up and down, yaws a little."""
     angle = 2 * np.pi * phase / PHASES
     return BEND * np.sin(angle), 0.82 + 0.18 * np.cos(angle)
 
 
 def animal_ring(species: Species, phase: int) -> list[Array]:
-    """Outlines in body coordinates that count as the animal: trunk, flukes, and the fins where they are long."""
+    """Outlines in body coordinates that count as the animal: trunk, flukes, fins where they are long."""
     bend, chord_share = stroke_of(phase)
     fins = fin_outlines(species) if species.fin_length > 0.2 else []
     return [body_outline(species, bend), fluke_outline(species, bend, chord_share), *fins]
@@ -65,7 +67,7 @@ def _fill(outlines: list[Array]) -> FloatImage:
         y = (outline[:, 1] + CANVAS_SIDE) * PX_PER_LENGTH - 0.5
         points = np.round(np.stack([x, y], axis=-1) * 16).astype(np.int32)
         cv2.fillPoly(mask, [points], 255, cv2.LINE_AA, 4)
-    return mask.astype(np.float32) / 255
+    return mask.astype(np.float32) / np.float32(255)
 
 
 def _noise(rng: np.random.Generator, along: int, across: int) -> FloatImage:
@@ -129,7 +131,7 @@ def _skin(species: Species, rng: np.random.Generator, bend: float) -> FloatImage
 
 
 def make_sprite(species: Species, rng: np.random.Generator, phase: int) -> Sprite:
-    """The animal seen from above, just awash: opaque along the back, fading where tail and fins lie deeper."""
+    """The animal seen from above, just awash: opaque along the back, fading where it lies deeper."""
     bend, chord_share = stroke_of(phase)
     skin = _skin(species, rng, bend)
     station, side = _body_grid()
@@ -142,13 +144,17 @@ def make_sprite(species: Species, rng: np.random.Generator, phase: int) -> Sprit
     opacity = np.maximum(trunk * np.clip(soft * 1.25 - 0.1, 0, 1) * depth_fade, np.maximum(flukes, fins))
     if species.dorsal_station > 0:
         fin_shape = np.exp(-(((station - species.dorsal_station) / 0.025) ** 2) - (side / 0.008) ** 2)
-        skin = skin * (1 - 0.6 * np.clip(fin_shape * 25 * species.dorsal_height, 0, 1))[..., None]
+        skin *= (1 - 0.6 * np.clip(fin_shape * 25 * species.dorsal_height, 0, 1))[..., None].astype(
+            np.float32
+        )
     opacity = cv2.GaussianBlur(opacity.astype(np.float32), (0, 0), 0.8)
     return _sprite_of(skin.astype(np.float32), np.asarray(opacity, np.float32))
 
 
 def make_foam(species: Species, rng: np.random.Generator) -> Sprite:
-    """Opacity of the white water round an animal at the surface: a broken rim, wash over the back, a short wake."""
+    """Opacity of the white water round an animal at the surface: a broken rim, wash over the back, a short
+    wake.
+    """
     station, side = _body_grid()
     body = _fill([body_outline(species, 0.0, 60)])
     rim = cv2.GaussianBlur(body, (0, 0), 6.0)
@@ -169,7 +175,7 @@ def make_foam(species: Species, rng: np.random.Generator) -> Sprite:
 
 
 def make_poster(species: Species, rng: np.random.Generator) -> Sprite:
-    """A whale printed on a rectangular sheet: 1.16 x 0.56 body lengths of flat printed sea, a white margin."""
+    """A whale printed on a rectangular sheet: 1.16 x 0.56 body lengths of printed sea, a white margin."""
     animal = make_sprite(species, rng, 0).levels[0].astype(np.float32)
     station, side = _body_grid()
     sheet = (np.abs(station - 0.5) < 0.58) & (np.abs(side) < 0.28)

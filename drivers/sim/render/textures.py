@@ -1,8 +1,8 @@
 """Periodic brightness textures for water and grass, and the colours that a brightness stands for.
 
-A surface is two grey textures that slide over each other; their sum, 0 to 255, picks a colour from a table of 256. One
-channel is warped in place of three, so a 640x480 view costs about two milliseconds, and sliding waves never look like
-a moving photograph.
+A surface is two grey textures that slide over each other; their sum, 0 to 255, picks a colour from a table of
+256. One channel is warped in place of three, so a 640x480 view costs about two milliseconds, and sliding
+waves never look like a moving photograph.
 """
 
 from dataclasses import dataclass
@@ -58,7 +58,9 @@ def _noise(rng: np.random.Generator, texel_m: float, scale_m: float, power: floa
 def _waves(
     rng: np.random.Generator, texel_m: float, longest_m: float, wind_rad: float
 ) -> tuple[Array, Array]:
-    """Height and slope towards the wind of a sea whose longest waves have `longest_m`, both of unit deviation."""
+    """Height and slope towards the wind of a sea whose longest waves have `longest_m`, both of unit
+    deviation.
+    """
     kn, ke, k = _wave_numbers(texel_m)
     along = (kn * np.cos(wind_rad) + ke * np.sin(wind_rad)) / k
     spread = 0.12 + along**2  # waves run mostly along the wind, never all of them
@@ -125,7 +127,9 @@ def grass_layers(rng: np.random.Generator) -> tuple[Layer, Layer]:
 
 
 def colour_table(dark: Array, middle: Array, light: Array, top: Array) -> Image:
-    """(256, 1, 3) BGR for a brightness: dark at 60, middle at 128, light at 185, top (foam, worn earth) from 225."""
+    """(256, 1, 3) BGR for a brightness: dark at 60, middle at 128, light at 185, top (foam, worn earth) from
+    225.
+    """
     stops = np.array([60.0, 128.0, 185.0, 225.0])
     colours = np.stack([dark, middle, light, top])
     table = np.stack([np.interp(np.arange(256), stops, colours[:, channel]) for channel in range(3)], axis=-1)
