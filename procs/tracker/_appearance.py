@@ -15,7 +15,8 @@ Image = NDArray[np.uint8]
 Map = NDArray[np.float32]
 
 BINS = 16  # a channel
-MIN_RANGE = 14.0  # Lab levels: below this span bins would count sensor noise
+RANGE_PERCENTILE = 90  # of the contrast in the first window: three quarters of the bins lie inside it
+MIN_RANGE = 6.0  # Lab levels: below this span bins would count sensor noise
 FLOOR = 0.03  # share of each histogram that is spread evenly: a colour never seen says nothing either way
 SMOOTHING_PX = 1.2  # window px: waves and glints are smaller than a body
 EM_ROUNDS = 6
@@ -45,7 +46,7 @@ class Appearance:
         """
         self.water = water_colour(lab, outside)
         contrast = np.abs(lab.astype(np.float32) - self.water).reshape(-1, 3)
-        self._range = np.maximum(np.percentile(contrast, 99, axis=0), MIN_RANGE).astype(np.float32)
+        self._range = np.maximum(np.percentile(contrast, RANGE_PERCENTILE, axis=0), MIN_RANGE).astype(np.float32)
         index = self._index(lab)
         self._inside, self._outside = _separate(index, prior, outside)
         self._anchor = self._inside.copy()
@@ -69,7 +70,8 @@ class Appearance:
 
     def _index(self, lab: Image) -> NDArray[np.intp]:
         levels = np.arange(256, dtype=np.float32)[:, None]
-        table = np.clip((levels - self.water) / self._range * (BINS / 2) + BINS / 2, 0, BINS - 1)
+        # Fine bins near the water's colour, coarse ones for foam and glint: black whales on black water differ little.
+        table = np.minimum(BINS / 2 * (1 + np.tanh((levels - self.water) / self._range)), BINS - 1)
         table = (table.astype(np.intp) * np.array([BINS * BINS, BINS, 1])).astype(np.intp)
         return np.asarray(table[:, 0][lab[..., 0]] + table[:, 1][lab[..., 1]] + table[:, 2][lab[..., 2]])
 
