@@ -216,11 +216,20 @@ def _agreement(now: Situation, memory: Memory) -> bool | None:
     return bool(identities.consensus)
 
 
+def _seen_again(now: Situation, memory: Memory) -> bool:
+    """The animal that this drone gave up is in the map again, fresh, and nobody else watches it."""
+    taken = any(row.animal == memory.lost_animal for row in now.others)
+    return memory.lost_animal >= 0 and not taken and now.map_position(memory.lost_animal, 2.0) is not None
+
+
 def rendezvous(now: Situation, memory: Memory, camera: Pinhole) -> Step:
     """To its place on the circle; then waits until everybody stands, but not for ever."""
     step = _keep_station(now, memory, camera)
     agreed = _agreement(now, memory)
-    if agreed:
+    if _seen_again(now, memory):
+        memory.animal, memory.lost_animal = memory.lost_animal, -1
+        step.event = Event.SEEN_AGAIN
+    elif agreed:
         memory.agreed_key = episode_key(now.inputs.identities)
         step.event = Event.AGREED
     elif agreed is False:
@@ -239,7 +248,10 @@ def register(now: Situation, memory: Memory, camera: Pinhole) -> Step:
     step = _keep_station(now, memory, camera)
     running = now.inputs.identities is not None and now.inputs.identities.episode_running
     agreed = _agreement(now, memory)
-    if agreed is not None:
+    if _seen_again(now, memory):
+        memory.animal, memory.lost_animal = memory.lost_animal, -1
+        step.event = Event.SEEN_AGAIN
+    elif agreed is not None:
         memory.agreed_key = episode_key(now.inputs.identities) if agreed else memory.agreed_key
         step.event = Event.AGREED if agreed else Event.NOT_AGREED
     elif memory.station_error_m > 3 * STATION_M and not running:

@@ -8,27 +8,15 @@ from procs.navigator.states import Event, State
 
 __all__ = ["overriding_events", "pilot_has_it"]
 
-OWN_MODES = (
-    6,
-    9,
-    17,
-)  # ArduCopter RTL, LAND, BRAKE: the bridge's or the autopilot's own doing, not a pilot's
-WATCH_MARGIN_S = (
-    2.0  # so that every drone's watch covers what was asked, though their clocks start a second apart
-)
+# So that every drone's watch covers what was asked, though their clocks start a second apart.
+WATCH_MARGIN_S = 2.0
 _GOING_HOME = (State.RETURN, State.LAND, State.LANDED)
 
 
 def pilot_has_it(now: Situation) -> bool:
-    """In the air and not guided: somebody else flies."""
+    """In the air and not guided: the pilot, a ground station or a failsafe of the autopilot flies."""
     vehicle = now.inputs.vehicle
-    return (
-        vehicle is not None
-        and now.vehicle_fresh
-        and not vehicle.guided
-        and not vehicle.landed
-        and vehicle.flight_mode not in OWN_MODES
-    )
+    return vehicle is not None and now.vehicle_fresh and not vehicle.guided and not vehicle.landed
 
 
 def overriding_events(now: Situation, memory: Memory) -> list[Event]:

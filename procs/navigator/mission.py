@@ -155,6 +155,8 @@ class Navigator:
         elif target == State.STANDBY:
             memory.surplus = event is Event.SURPLUS or memory.surplus
             memory.animal = -1
+        elif target == State.ASSIGN:
+            memory.lost_animal = -1
         elif target in (State.RETURN, State.LAND, State.LANDED):
             memory.find, memory.animal, memory.surplus = None, -1, False
         memory.state, memory.since_us, memory.reason = target, inputs.utime, event.value

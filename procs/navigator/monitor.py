@@ -62,7 +62,8 @@ def conflict(now: Situation, memory: Memory) -> bool:
         if row.state != State.MONITOR or row.animal < 0:
             continue
         if row.animal == memory.animal:
-            doubted = True
+            # Of two that claim one animal the higher id gathers again; the lower keeps it in view.
+            doubted = doubted or row.id < now.drone_id
             continue
         theirs = now.map_position(row.animal)
         mine = now.map_position(memory.animal)
@@ -75,7 +76,6 @@ def conflict(now: Situation, memory: Memory) -> bool:
     elif memory.conflict_since_us == 0:
         memory.conflict_since_us = now.utime
     lasted = memory.conflict_since_us > 0 and now.seconds_since(memory.conflict_since_us) > CONFLICT_S
-    # Of two drones with the same animal one must go: whose id is higher. Both gather where the places clash.
     return lasted and memory.n_conflicts < MAX_CONFLICTS
 
 
@@ -92,6 +92,7 @@ def monitor(now: Situation, memory: Memory, camera: Pinhole) -> Step:
     if now.command == podwatch.operator_t.LEAVE and _told_to_leave(now, memory):
         event = Event.LEAVE
     elif unseen_s > GIVE_UP_S:
+        memory.lost_animal = memory.animal
         event = Event.ANIMAL_LOST
     elif conflict(now, memory):
         memory.n_conflicts += 1

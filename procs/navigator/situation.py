@@ -88,6 +88,7 @@ class Memory:
     target_waypoint: int | None = None
     find: Find | None = None
     animal: int = -1
+    lost_animal: int = -1  # given up as lost; taken up again when the map sees it and nobody else has it
     surplus: bool = False
     gather_key: EpisodeKey = (0, 0)  # newest episode that had ended when this gathering began
     gather_since_us: int = 0

@@ -47,6 +47,7 @@ class Event(Enum):
     OFF_STATION = "pushed off station"
     NOT_AGREED = "the ring did not agree"
     AGREED = "the ring agreed on the animals"
+    SEEN_AGAIN = "its animal is seen again"
     CERTIFIED = "an animal of its own"
     SURPLUS = "fewer animals than drones"
     NOT_CERTIFIED = "no certificate in time"
@@ -110,6 +111,7 @@ RULES = (
     Rule((S.REGISTER,), E.OFF_STATION, S.RENDEZVOUS),
     Rule((S.REGISTER,), E.NOT_AGREED, S.RENDEZVOUS),
     Rule((S.RENDEZVOUS, S.REGISTER), E.AGREED, S.ASSIGN),
+    Rule((S.RENDEZVOUS, S.REGISTER), E.SEEN_AGAIN, S.MONITOR),
     Rule((S.ASSIGN,), E.NOT_CERTIFIED, S.RENDEZVOUS),
     Rule((S.ASSIGN, S.STANDBY), E.CERTIFIED, S.MONITOR),
     Rule((S.ASSIGN, S.MONITOR), E.SURPLUS, S.STANDBY),

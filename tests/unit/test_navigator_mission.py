@@ -129,6 +129,11 @@ def test_an_animal_that_stays_away_sends_the_drone_back_to_gather() -> None:
     gone_s = fleet.run(60.0, lambda: not fleet.all_in(State.MONITOR))
     assert 39.0 < gone_s < 42.0
     assert fleet.drone(1).navigator.state == State.RENDEZVOUS
+    fleet.run(5.0)
+    fleet.visible = True
+    fleet.run(1.0)
+    assert fleet.drone(1).navigator.state == State.MONITOR
+    assert fleet.drone(1).navigator.memory.animal == 0
 
 
 def test_a_drone_lost_in_monitor_leaves_the_others_at_work() -> None:
@@ -136,6 +141,17 @@ def test_a_drone_lost_in_monitor_leaves_the_others_at_work() -> None:
     fleet.drone(2).alive = False
     fleet.run(10.0)
     assert fleet.all_in(State.MONITOR)
+
+
+def test_of_two_drones_with_one_animal_the_higher_gathers_again() -> None:
+    fleet = flown_to(State.MONITOR, n=2)
+    fleet.run(2.0)
+    fleet.drone(2).navigator.memory.animal = fleet.drone(1).navigator.memory.animal
+    fleet.run(6.0, lambda: fleet.drone(2).navigator.state != State.MONITOR)
+    assert fleet.drone(2).navigator.state == State.RENDEZVOUS
+    assert fleet.drone(1).navigator.state == State.MONITOR
+    fleet.run(60.0, lambda: fleet.all_in(State.MONITOR))
+    assert len(set(animals_of(fleet))) == 2
 
 
 def test_without_consensus_the_fleet_tries_again_from_other_places() -> None:
