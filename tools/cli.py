@@ -1,5 +1,95 @@
-"""The command line: `podwatch COMMAND`."""
+"""The command line: `podwatch COMMAND`. Heavy imports wait until their command is called."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from tools import log
+from tools.errors import plain_errors
+from tools.sim.command import sim
+
+app = typer.Typer(
+    help="A fleet of small drones that finds a pod of whales, agrees which is which, and keeps each in view.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    add_completion=False,
+)
+train = typer.Typer(help="Train the models that ship (needs the `train` extra).", no_args_is_help=True)
+bench = typer.Typer(help="Measure, and print every figure with its bar.", no_args_is_help=True)
+app.command("sim")(sim)
+app.add_typer(log.app, name="log")
+app.add_typer(train, name="train")
+app.add_typer(bench, name="bench")
+
+
+@app.command("views")
+def views(
+    pictures: Annotated[list[Path], typer.Argument(help="Pictures or videos of one scene from several viewpoints.")],
+    out: Annotated[Path, typer.Option(help="The figure to write.")] = Path("views.png"),
+) -> None:
+    """Detect, register round the ring and assign, on pictures that stand for several drones' views."""
+    from tools.views import command  # noqa: PLC0415
+
+    with plain_errors():
+        command(pictures, out)
+
+
+@app.command("report")
+def report(folder: Annotated[Path, typer.Argument(help="A run's folder.")]) -> None:
+    """Write report.html (and summary.json) of a run's folder anew."""
+    from tools.sim.run import finish  # noqa: PLC0415
+
+    with plain_errors():
+        finish(folder)
+    typer.echo(str(folder / "report.html"))
+
+
+@app.command("render")
+def render(
+    out: Annotated[Path, typer.Argument(help="Folder to write, in the YOLO layout.")],
+    n: Annotated[int, typer.Option(min=1)] = 100,
+    seed: Annotated[int, typer.Option(min=0)] = 0,
+    split: Annotated[str, typer.Option(help="train, val, val_sperm or empty")] = "train",
+    width: Annotated[int, typer.Option(min=64)] = 640,
+    height: Annotated[int, typer.Option(min=64)] = 480,
+) -> None:
+    """Render labelled scenes for training and validation."""
+    from tools.render import command  # noqa: PLC0415
+
+    command(out, n, seed, split, width, height)
+
+
+@train.command("detector")
+def train_detector(
+    out: Annotated[Path, typer.Option(help="Folder for checkpoints, log and export.")] = Path("runs/detector"),
+    data: Annotated[Path | None, typer.Option(help="A data.yaml in the YOLO layout to train on as well.")] = None,
+    steps: Annotated[int | None, typer.Option(min=1)] = None,
+    seed: Annotated[int, typer.Option(min=0)] = 0,
+    smoke: Annotated[bool, typer.Option("--smoke", help="A few steps, export and check only.")] = False,
+) -> None:
+    """Train the detector and export it to ONNX."""
+    try:
+        from tools.train_detector import Settings, command  # noqa: PLC0415
+    except ImportError as error:
+        typer.echo(f"podwatch: {error.name} is missing; install the extra: pip install 'podwatch[train]'", err=True)
+        raise typer.Exit(3) from None
+    command(out, data, Settings.steps if steps is None else steps, seed, smoke)
+
+
+@bench.command("fleet")
+def bench_fleet(
+    seeds: Annotated[int, typer.Option(min=1, help="Default missions in lockstep.")] = 10,
+    out: Annotated[Path, typer.Option(help="Folder for the runs and the table.")] = Path("runs/bench"),
+    quick: Annotated[bool, typer.Option("--quick", help="Boxes in place of pixels, no processes mode.")] = False,
+) -> None:
+    """Fly many missions and print every figure of the fleet."""
+    from tools.bench_fleet import command  # noqa: PLC0415
+
+    with plain_errors():
+        command(seeds, out, quick=quick)
 
 
 def main() -> None:
-    raise SystemExit(0)
+    """The entry point of the `podwatch` script."""
+    app()

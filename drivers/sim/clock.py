@@ -28,15 +28,14 @@ class ClockPage:
         self._map = mmap.mmap(descriptor, PAGE_BYTES)
         os.close(descriptor)
         if create:
-            self._version = 0
-            self.set(0.0, 1.0)
+            self.set(0.0, 0.0)
 
     def set(self, sim_us: float, rate: float) -> None:
         """From now on simulation time runs from `sim_us` at `rate` (0 stands still)."""
-        self._version += 2
+        version = MAPPING.unpack_from(self._map, 0)[0] + 2
         now_ns = time.monotonic_ns()
-        MAPPING.pack_into(self._map, 0, self._version - 1, sim_us, now_ns, rate)
-        MAPPING.pack_into(self._map, 0, self._version, sim_us, now_ns, rate)
+        MAPPING.pack_into(self._map, 0, version - 1, sim_us, now_ns, rate)
+        MAPPING.pack_into(self._map, 0, version, sim_us, now_ns, rate)
 
     def read(self) -> tuple[float, float]:
         """(simulation time now in us, rate)."""

@@ -45,7 +45,6 @@ class ProcessFleet:
         self._ether_ports = dict(zip(roster, ports[2 * len(roster) :], strict=False))
         self._page_path = SHARED_FOLDER / f"podwatch_{self._run}_clock"
         self._page = ClockPage(self._page_path, create=True)
-        self._page.set(0.0, 0.0)
         self._heard: set[str] = set()
         self._world = lcm.LCM(world_url(self._slot.number))
         self._buses = [self._listen(drone_id) for drone_id in roster]

@@ -98,9 +98,8 @@ def write_truth_notes(
 def finish(folder: Path) -> dict[str, object]:
     """summary.json and report.html of a run -> the summary."""
     from tools.report import make_report  # noqa: PLC0415 - the report's libraries are slow to import
-    from tools.summary import summarise  # noqa: PLC0415
+    from tools.summary import write_summary  # noqa: PLC0415
 
-    summary = summarise(folder)
-    (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
+    summary = write_summary(folder)
     make_report(folder)
     return summary

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+from http.client import HTTPException
 from pathlib import Path
 from typing import Any
 from xmlrpc.client import Fault, ServerProxy
@@ -99,7 +100,7 @@ class Supervisor:
             stdin=subprocess.DEVNULL,
             start_new_session=True,  # a Ctrl-C is for the tool, which then stops the tree in order
         )
-        self._proxy = _proxy(socket)
+        self._socket = socket
 
     @property
     def pid(self) -> int:
@@ -113,8 +114,8 @@ class Supervisor:
     def states(self) -> dict[str, tuple[str, int]]:
         """Program -> (supervisord's word for its state, pid); empty while supervisord does not answer yet."""
         try:
-            rows: Any = self._proxy.supervisor.getAllProcessInfo()
-        except (OSError, Fault):
+            rows: Any = _proxy(self._socket).supervisor.getAllProcessInfo()
+        except (OSError, HTTPException, Fault):
             return {}
         return {row["name"]: (row["statename"], row["pid"]) for row in rows}
 
@@ -133,7 +134,7 @@ class Supervisor:
         for pid in pids:
             if pid:
                 os.kill(pid, signal.SIGSTOP)
-        self._proxy.supervisor.stopProcessGroup(f"drone_{drone_id}", False)
+        _proxy(self._socket).supervisor.stopProcessGroup(f"drone_{drone_id}", False)
 
     def stop(self) -> None:
         """Stop the tree in its order and wait for it."""
@@ -148,6 +149,7 @@ class Supervisor:
 
 
 def _proxy(socket: Path) -> Any:
+    """A new connection for each call: supervisor's transport cannot go on after one that failed."""
     from supervisor.xmlrpc import SupervisorTransport  # noqa: PLC0415 - slow to import
 
     return ServerProxy("http://127.0.0.1", transport=SupervisorTransport(None, None, f"unix://{socket}"))

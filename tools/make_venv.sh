@@ -1,0 +1,21 @@
+#!/bin/sh
+# Make the environment VENV with PYTHON: `sh tools/make_venv.sh PYTHON VENV`. Debian's python3 comes without ensurepip unless
+# python3-venv is installed; then pip is fetched by what the machine has, or the missing package is named.
+set -eu
+python=$1
+venv=$2
+if ! "$python" -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))'; then
+    echo "podwatch needs Python 3.11 to 3.13; $("$python" --version) was found. Try: make PYTHON=python3.12" >&2
+    exit 1
+fi
+if ! "$python" -m venv "$venv" 2>/dev/null; then
+    rm -rf "$venv"
+    if [ "$(id -u)" = 0 ] && command -v apt-get >/dev/null; then
+        apt-get update -qq && apt-get install -y -qq python3-venv
+        "$python" -m venv "$venv"
+    else
+        echo "python's venv module is missing. Run: sudo apt-get install python3-venv" >&2
+        exit 1
+    fi
+fi
+"$venv/bin/python" -m pip install --quiet --disable-pip-version-check -e '.[dev]'
