@@ -195,8 +195,8 @@ def _window(
 def _longest_side(photo: Sample) -> float:
     """Of the first animal's box, px; a picture without one is taken to show animals a third of its width."""
     if not len(photo.boxes):
-        return photo.image.shape[1] / 3
-    return float(max(photo.boxes[0, 2] - photo.boxes[0, 0], photo.boxes[0, 3] - photo.boxes[0, 1]))
+        return float(photo.image.shape[1] / 3)
+    return float(np.max(photo.boxes[0, 2:4] - photo.boxes[0, :2]))
 
 
 def _length_px(rng: np.random.Generator, side: int) -> float:
@@ -257,9 +257,7 @@ def _pasted(photos: Sequence[Sample], seas: Sequence[Sample], rng: np.random.Gen
         if size[0] >= side or size[1] >= side:
             continue
         u, v = int(rng.integers(0, side - size[0])), int(rng.integers(0, side - size[1]))
-        box = (photo.boxes[0, :4] - _row([left, top, left, top])) * np.float32(scale) + np.float32(
-            [u, v, u, v]
-        )
+        box = (photo.boxes[0, :4] - _row([left, top, left, top])) * np.float32(scale) + _row([u, v, u, v])
         if any(_overlap(box, other) > 0.02 for other in boxes[:, :4]):
             continue
         piece = cv2.resize(photo.image[top:bottom, left:right], size, interpolation=cv2.INTER_AREA).astype(
@@ -330,14 +328,14 @@ def augment(image: Image, rng: np.random.Generator) -> Image:
         picture *= np.float32(rng.uniform(0.15, 0.5))
     blur = rng.random()
     if blur < 0.15:
-        picture = cv2.GaussianBlur(picture, (0, 0), float(rng.uniform(0.4, 1.4)))
+        picture = np.asarray(cv2.GaussianBlur(picture, (0, 0), float(rng.uniform(0.4, 1.4))), np.float32)
     elif blur < 0.22:  # the drone moves while the shutter is open
         length = int(rng.integers(3, 8))
         kernel = np.zeros((length, length), np.float32)
         angle, middle_px = rng.uniform(0, np.pi), (length - 1) / 2
         for step in np.linspace(-middle_px, middle_px, 2 * length):
             kernel[round(middle_px + step * np.sin(angle)), round(middle_px + step * np.cos(angle))] = 1
-        picture = cv2.filter2D(picture, -1, kernel / kernel.sum())
+        picture = np.asarray(cv2.filter2D(picture, -1, kernel / kernel.sum()), np.float32)
     if rng.random() < 0.3:
         picture = picture + np.float32(rng.uniform(1, 9)) * rng.standard_normal(
             picture.shape, dtype=np.float32

@@ -43,17 +43,17 @@ class Score:
 def box_iou(first: NDArray[np.float32], second: NDArray[np.float32]) -> Array:
     """IoU of (N, 4) with (M, 4) boxes xyxy -> (N, M)."""
     shared = _shared(first, second)
-    return shared / np.maximum(_area(first)[:, None] + _area(second)[None] - shared, 1e-9)
+    return np.asarray(shared / np.maximum(_area(first)[:, None] + _area(second)[None] - shared, 1e-9))
 
 
 def _area(boxes: NDArray[np.float32]) -> Array:
-    return np.prod(np.clip(boxes[:, 2:4] - boxes[:, :2], 0, None).astype(float), axis=1)
+    return np.asarray(np.prod(np.clip(boxes[:, 2:4] - boxes[:, :2], 0, None).astype(float), axis=1))
 
 
 def _shared(first: NDArray[np.float32], second: NDArray[np.float32]) -> Array:
     low = np.maximum(first[:, None, :2], second[None, :, :2])
     high = np.minimum(first[:, None, 2:4], second[None, :, 2:4])
-    return np.prod(np.clip(high - low, 0, None).astype(float), axis=2)
+    return np.asarray(np.prod(np.clip(high - low, 0, None).astype(float), axis=2))
 
 
 def match(

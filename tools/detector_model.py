@@ -49,12 +49,12 @@ class SplitBlock(nn.Module):
 
     def __init__(self, channels: int) -> None:
         super().__init__()
-        self.half = channels // 2
-        self.deep = nn.Sequential(ConvUnit(self.half, self.half), ConvUnit(self.half, self.half))
+        self.split = channels // 2
+        self.deep = nn.Sequential(ConvUnit(self.split, self.split), ConvUnit(self.split, self.split))
         self.mix = ConvUnit(channels, channels, 1)
 
     def forward(self, x: Tensor) -> Tensor:
-        kept, worked = x[:, : self.half], x[:, self.half :]  # (B, C/2, H, W) each
+        kept, worked = x[:, : self.split], x[:, self.split :]  # (B, C/2, H, W) each
         mixed: Tensor = self.mix(torch.cat([kept, worked + self.deep(worked)], 1))  # (B, C, H, W)
         return mixed + x
 
@@ -94,9 +94,9 @@ class WhaleDetector(nn.Module):
             nn.Sequential(ConvUnit(c.head, c.head), nn.Conv2d(c.head, 4 + classes, 1)) for _ in STRIDES
         )
         for head in self.heads:
-            last = head[1]
-            nn.init.constant_(last.bias[:4], 1.0)
-            nn.init.constant_(last.bias[4:], float(torch.logit(torch.tensor(SMALLEST_PRIOR))))
+            bias = head.get_parameter("1.bias")
+            nn.init.constant_(bias[:4], 1.0)
+            nn.init.constant_(bias[4:], float(torch.logit(torch.tensor(SMALLEST_PRIOR))))
 
     def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
         s4 = self.to_s4(images)  # (B, 24, H/4, W/4)

@@ -214,7 +214,7 @@ class Detector:
                 sides = [int(side) for side in (said if isinstance(said, (list, tuple)) else (said, said))]
             except (ValueError, SyntaxError, TypeError) as error:
                 raise ModelError(
-                    f"{self._path}: metadata imgsz {self._metadata['imgsz']!r} is not [height, width]; export it again"
+                    f"{self._path}: metadata imgsz {self._metadata['imgsz']!r} is not [height, width]"
                 ) from error
         return int(sides[1]), int(sides[0])
 

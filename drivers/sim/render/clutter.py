@@ -101,7 +101,7 @@ def add_clutter(image: Image, rng: np.random.Generator, length_px: float, on_wat
             angle = rng.uniform(0, 2 * np.pi)
             wing = span / 2 * np.array([np.cos(angle), np.sin(angle)])
             back = span * 0.2 * np.array([-np.sin(angle), np.cos(angle)])
-            points = np.array([back - wing, np.zeros(2), back + wing]) + (u, v)
+            points = np.array([back - wing, np.zeros(2), back + wing]) + np.array([u, v])
             tone = int(rng.choice([245, 235, 60]))
             thick = max(int(span / 7), 1)
             cv2.polylines(
