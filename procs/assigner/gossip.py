@@ -1,15 +1,18 @@
 """The exchange by which a ring agrees who takes which animal, and knows that it has agreed (DESIGN section
 4).
 
-Every packet is whole state: which rows, choices and confirmations the sender holds, all choices, and a
-window of rows that goes round. Losing, repeating or reordering packets costs time and nothing else. An agent
-decides when it holds every living member's row: all solve the same table and find the same answer. It moves
-only with the certificate: it holds every member's choice, no two are the same, and where an animal changes
-hands, everybody has confirmed, so that nobody takes an animal that its holder may still watch.
+Every packet is whole state: which rows, choices, confirmations and releases the sender holds, all choices,
+and a window of rows that goes round. Losing, repeating or reordering packets costs time and nothing else. An
+agent decides when it holds every living member's row: all solve the same table and find the same answer. It
+moves only with the certificate: it holds every member's choice, no two are the same, and who watched the
+animal until now has let go of it. A holder lets go when everybody has confirmed that all choices are held
+and distinct; so nobody takes an animal that its holder may still watch, and nobody gives one up for an
+exchange that never ends.
 
-Packet: version, sender, n_members (1 byte each); three bitmaps by member index (rows, choices, confirmed),
-lowest bit first; 1 byte an animal id for each choice held, 255 for none; then rows up to the end: member,
-previous animal (255 none), n (1 byte each), n ids (1 byte), n costs (2 bytes, little-endian, costs.py).
+Packet: version, sender, n_members (1 byte each); four bitmaps by member index (rows, choices, confirmed,
+released), lowest bit first; 1 byte an animal id for each choice held, 255 for none; then rows up to the end:
+member, previous animal (255 none), n (1 byte each), n ids (1 byte), n costs (2 bytes, little-endian,
+costs.py).
 """
 
 from collections.abc import Iterable, Sequence
@@ -50,7 +53,8 @@ class Packet:
     n_members: int
     rows_held: frozenset[int]
     choices: dict[int, int]  # member -> animal id, -1 none
-    confirmed: frozenset[int]
+    confirmed: frozenset[int]  # they hold every member's choice, all distinct
+    released: frozenset[int]  # they have let go of the animal that they watched before
     rows: dict[int, Row]
 
 
@@ -63,7 +67,9 @@ def encode(packet: Packet) -> bytes:
     """The packet's bytes; `decode` gives it back."""
     n = packet.n_members
     parts = [bytes([VERSION, packet.sender, n])]
-    parts += [_bitmap(held, n) for held in (packet.rows_held, packet.choices, packet.confirmed)]
+    parts += [
+        _bitmap(held, n) for held in (packet.rows_held, packet.choices, packet.confirmed, packet.released)
+    ]
     parts.append(bytes(packet.choices[k] % 256 for k in sorted(packet.choices)))
     for member in sorted(packet.rows):
         row = packet.rows[member]
@@ -108,6 +114,7 @@ def decode(data: bytes) -> Packet:
     rows_held = reader.members(n, "the rows' bitmap")
     chosen = reader.members(n, "the choices' bitmap")
     confirmed = reader.members(n, "the confirmations' bitmap")
+    released = reader.members(n, "the releases' bitmap")
     ids = reader.take(len(chosen), "the choices")
     rows = {}
     while reader.at < len(data):
@@ -124,7 +131,7 @@ def decode(data: bytes) -> Packet:
             )
         rows[member] = Row(row_ids, codes, -1 if previous == NO_ID else previous)
     choices = {k: -1 if animal == NO_ID else animal for k, animal in zip(chosen, ids, strict=True)}
-    return Packet(sender, n, frozenset(rows_held), choices, frozenset(confirmed), rows)
+    return Packet(sender, n, frozenset(rows_held), choices, frozenset(confirmed), frozenset(released), rows)
 
 
 class Agent:
@@ -164,7 +171,7 @@ class Agent:
         self.index, self.n_members, self.threshold_m = index, n_members, threshold_m
         codes = tuple(int(code) for code in cost_codes(costs))
         row = Row(tuple(int(goal) for goal in goals), codes, previous if previous not in forbidden else -1)
-        self._room = MAX_PACKET_BYTES - 3 - 3 * ((n_members + 7) // 8) - n_members
+        self._room = MAX_PACKET_BYTES - 3 - 4 * ((n_members + 7) // 8) - n_members
         if row.n_bytes > self._room:
             most = (self._room - 3) // 3
             raise ValueError(
@@ -173,6 +180,8 @@ class Agent:
         self.rows: dict[int, Row] = {index: row}
         self._choices: dict[int, int] = {}
         self._confirmed: set[int] = set()
+        self._released: set[int] = set()
+        self._certified = False
         self._dropped: set[int] = set()
         self._heard: dict[int, Packet] = {}  # the newest packet of each sender, for what it lacks
         self._next_row = 0
@@ -201,17 +210,19 @@ class Agent:
 
     @property
     def certified(self) -> bool:
-        """It may move: every living member's choice is held, all are distinct, and what changes hands is
-        confirmed.
+        """It may take its choice: all choices are held and distinct, and who held that animal has let it
+        go.
         """
-        if not self._all_distinct():
-            return False
-        return not self._changes_hands() or all(k in self._confirmed for k in self.living)
+        return self._certified
 
     @property
     def animal(self) -> int:
-        """What it shall watch now: its choice once certified, its previous animal before that; -1 none."""
-        return self._choices[self.index] if self.certified else self.rows[self.index].previous
+        """What it shall watch now, -1 none: its choice once certified, before that what it watched until
+        now.
+        """
+        if self._certified:
+            return self._choices[self.index]
+        return -1 if self.index in self._released else self.rows[self.index].previous
 
     def drop_member(self, index: int) -> None:
         """A member is lost: its row, choice and confirmation are waited for no more. One's own index is
@@ -255,6 +266,7 @@ class Agent:
             known = self._choices.setdefault(member, animal)
             self.clash = self.clash or known != animal
         self._confirmed |= packet.confirmed
+        self._released |= packet.released
 
     def _advance(self) -> None:
         """Decide once every living member's row is here; a decision is never changed, for others may have
@@ -262,8 +274,13 @@ class Agent:
         """
         if self.choice is None and all(k in self.rows for k in self.living):
             self._choices[self.index] = self._solve()
-        if self._all_distinct():
-            self._confirmed.add(self.index)
+        if not self._all_distinct():
+            return
+        self._confirmed.add(self.index)
+        if self._is_taken_from() and all(k in self._confirmed for k in self.living):
+            self._released.add(self.index)
+        # Once given, a certificate stands: others rest on it.
+        self._certified = self._certified or self._is_free()
 
     def _solve(self) -> int:
         members = self.living
@@ -284,19 +301,27 @@ class Agent:
         taken = [self._choices[k] for k in self.living if self._choices[k] >= 0]
         return len(taken) == len(set(taken))
 
-    def _changes_hands(self) -> bool:
-        """Some member takes an animal that another watches now. Rows that are not held may hide one."""
-        members = self.living
-        if any(k not in self.rows for k in members):
+    def _is_taken_from(self) -> bool:
+        """Another member takes the animal that this one watched until now."""
+        before = self.rows[self.index].previous
+        return before >= 0 and any(self._choices[k] == before for k in self.living if k != self.index)
+
+    def _is_free(self) -> bool:
+        """Nobody else may still watch the animal of its choice. A row that is not held may hide a holder."""
+        choice, members = self._choices[self.index], self.living
+        if choice < 0:
             return True
-        holder = {self.rows[k].previous: k for k in members if self.rows[k].previous >= 0}
-        return any(holder.get(self._choices[k], k) != k for k in members if self._choices[k] >= 0)
+        others = [k for k in members if k != self.index and k not in self._released]
+        return all(k in self.rows and self.rows[k].previous != choice for k in others)
 
     def _all_told(self) -> bool:
         """All who were heard hold every row, choice and confirmation that a living member has to give."""
         needed = set(self.living)
         return bool(self._heard) and all(
-            needed <= p.rows_held and needed <= p.choices.keys() and needed <= p.confirmed
+            needed <= p.rows_held
+            and needed <= p.choices.keys()
+            and needed <= p.confirmed
+            and self._released <= p.released
             for p in self._heard.values()
         )
 
@@ -307,6 +332,7 @@ class Agent:
             frozenset(self.rows),
             dict(self._choices),
             frozenset(self._confirmed),
+            frozenset(self._released),
             self._window(),
         )
 

@@ -40,7 +40,7 @@ def gather_height(
     half_rad = vfov_rad / 2 - tilt_margin_rad
     if half_rad <= 0:
         raise ValueError(
-            f"field of view {vfov_rad:.3f} rad leaves nothing beside {tilt_margin_rad:.3f} rad of tilt; widen it"
+            f"field of view {vfov_rad:.3f} rad is too narrow beside {tilt_margin_rad:.3f} rad of tilt"
         )
     wanted_m = (pod_radius_m + circle_radius_m) / float(np.tan(half_rad))
     return float(np.clip(wanted_m, lowest_m, max(highest_m / (1 + LAYER_SPAN), lowest_m)))

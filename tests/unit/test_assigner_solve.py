@@ -1,0 +1,121 @@
+"""Assignment as one call: the exact method's answers, rounds and bytes, and the 16-bit costs that it rests
+on.
+"""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.optimize import linear_sum_assignment
+
+from procs.assigner.costs import FORBIDDEN, UNIT, code_values, cost_codes, solve_table
+from procs.assigner.solve import assign
+
+quick = settings(deadline=None, max_examples=80)
+
+
+@quick
+@given(st.floats(1e-4, 60_000))
+def test_a_code_keeps_a_cost_to_one_part_in_4096(cost: float) -> None:
+    value = float(code_values(cost_codes(np.array([cost])))[0]) * UNIT
+    assert abs(value - cost) <= cost / 4095
+
+
+@quick
+@given(st.floats(0, 1e5), st.floats(0, 1e5))
+def test_codes_keep_the_order_of_costs(one: float, other: float) -> None:
+    codes = cost_codes(np.sort(np.array([one, other])))
+    assert codes[0] <= codes[1] < FORBIDDEN
+
+
+def test_every_code_comes_back_from_its_value() -> None:
+    codes = np.arange(FORBIDDEN, dtype=np.uint16)
+    values = code_values(codes)
+    assert (np.diff(values) > 0).all()
+    np.testing.assert_array_equal(cost_codes(values * UNIT), codes)
+    assert cost_codes(np.array([np.inf]))[0] == FORBIDDEN
+
+
+def test_a_table_worked_by_hand() -> None:
+    # Each would like goal 0; the whole is cheapest when the one who gains least steps back.
+    costs = np.array([[1.0, 2.0, 9.0], [1.0, 6.0, 9.0]])
+    np.testing.assert_array_equal(solve_table(cost_codes(costs)), [1, 0])
+    np.testing.assert_array_equal(assign(costs).goals, [1, 0])
+
+
+def test_forbidden_goals_are_given_to_nobody() -> None:
+    costs = np.array([[np.inf, 1.0], [np.inf, 2.0]])
+    result = assign(costs)
+    np.testing.assert_array_equal(result.goals, [1, -1])
+    assert not result.is_distinct
+
+
+@pytest.mark.parametrize("n", range(1, 13))
+def test_the_exact_method_is_optimal_within_its_rounds_and_bytes(n: int) -> None:
+    for n_goals in (n, 2 * n):
+        random = np.random.default_rng([0, n, n_goals])
+        quality = []
+        for _ in range(20):
+            points = random.random((n + n_goals, 2))
+            costs = np.linalg.norm(points[:n, None] - points[None, n:], axis=2)
+            result = assign(costs)
+            best = costs[linear_sum_assignment(costs)].sum()
+            quality.append(best / costs[np.arange(n), result.goals].sum())
+            assert result.is_distinct
+            assert len(set(result.goals.tolist())) == n
+            assert result.rounds == n // 2
+            assert result.bytes_sent.max() <= (n - 1) * (2 * n_goals + 1)
+        assert np.mean(quality) >= 0.99999
+
+
+@pytest.mark.parametrize(("loss", "share"), [(0.1, 0.995), (0.2, 0.97)])
+def test_whole_tables_outlast_loss(loss: float, share: float) -> None:
+    random = np.random.default_rng(0)
+    results = [assign(random.random((5, 7)), loss=loss, seed=k) for k in range(400)]
+    assert np.mean([result.is_distinct for result in results]) >= share
+    for result in results:
+        taken = result.goals[result.goals >= 0]
+        assert len(set(taken.tolist())) == len(taken)
+        assert result.is_distinct == (len(taken) == 5)
+
+
+def test_with_everything_lost_everybody_holds() -> None:
+    result = assign(np.random.default_rng(0).random((4, 6)), loss=1.0)
+    np.testing.assert_array_equal(result.goals, [-1] * 4)
+    assert not result.is_distinct
+    assert (result.bytes_sent > 0).all()
+
+
+def test_one_agent_needs_no_messages_and_surplus_agents_get_none() -> None:
+    alone = assign(np.array([[3.0, 1.0, 2.0]]))
+    assert alone.goals.tolist() == [1]
+    assert alone.rounds == 0
+    assert alone.bytes_sent.tolist() == [0]
+    crowd = assign(np.array([[1.0], [2.0], [3.0]]))
+    assert crowd.goals.tolist() == [0, -1, -1]
+    assert crowd.is_distinct
+    empty = assign(np.zeros((2, 0)))
+    assert empty.goals.tolist() == [-1, -1]
+
+
+def test_the_same_seed_gives_the_same_answer() -> None:
+    costs = np.random.default_rng(3).random((6, 9))
+    one, other = assign(costs, loss=0.4, seed=7), assign(costs, loss=0.4, seed=7)
+    np.testing.assert_array_equal(one.goals, other.goals)
+    np.testing.assert_array_equal(one.bytes_sent, other.bytes_sent)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"method": "gnn"}, "method 'gnn' is not known; this release has: exact"),
+        ({"costs": np.zeros(3)}, r"costs of shape \(3,\)"),
+        ({"costs": np.array([[np.nan]])}, "cost nan"),
+        ({"costs": np.array([[-1.0]])}, "cost -1.0"),
+        ({"loss": 1.5}, "loss 1.5"),
+        ({"rounds": 0}, "rounds 0"),
+    ],
+)
+def test_bad_arguments_are_refused_with_their_value(arguments: dict, words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        assign(**({"costs": np.ones((2, 2))} | arguments))
