@@ -19,12 +19,21 @@ from numpy.typing import NDArray
 
 from drivers.cameras.pinhole import Pinhole
 from lcmtypes import channels
-from lcmtypes.podwatch import world_state_t
 from logs.exceptions import LogError
 from logs.reader import read, segments
 from procs.navigator.states import State
 
-__all__ = ["Clock", "DroneLog", "EvidenceError", "Labels", "Run", "Truth", "drone_log", "load_run", "state_name"]
+__all__ = [
+    "Clock",
+    "DroneLog",
+    "EvidenceError",
+    "Labels",
+    "Run",
+    "Truth",
+    "drone_log",
+    "load_run",
+    "state_name",
+]
 
 Array = NDArray[np.float64]
 Samples = dict[str, list[tuple[float, Any]]]
@@ -165,8 +174,8 @@ def load_run(folder: Path) -> Run:
         raise EvidenceError(
             f"{folder / 'truth.json'}: no usable {error}; it must give clocks and camera, fly again"
         ) from error
-    truth = _read_truth(folder / "truth.mcap", about, camera)
-    logs, messages, problems = [], {}, []
+    truth, problems = _read_truth(folder / "truth.mcap", about, camera)
+    logs, messages = [], {}
     for drone_id in sorted(clocks):
         samples, complaints = _read_log(folder, drone_id, clocks[drone_id])
         messages[drone_id] = samples
@@ -189,8 +198,8 @@ def _read_json(path: Path) -> dict[str, Any]:
     return data
 
 
-def _read_truth(path: Path, about: dict[str, Any], camera: Pinhole) -> Truth:
-    states = _world_states(path)
+def _read_truth(path: Path, about: dict[str, Any], camera: Pinhole) -> tuple[Truth, list[str]]:
+    states, problems = _world_states(path)
     t_s = np.array([state.utime * 1e-6 for state in states])
     drones = _tracks(
         (
@@ -213,23 +222,25 @@ def _read_truth(path: Path, about: dict[str, Any], camera: Pinhole) -> Truth:
         (len(states), 4),
     )
     deaths = {int(drone_id): float(at_s) for drone_id, at_s in about.get("deaths", {}).items()}
-    return Truth(camera, t_s, drones, animals, deaths, bool(about.get("scene_truth", True)))
+    return Truth(camera, t_s, drones, animals, deaths, bool(about.get("scene_truth", True))), problems
 
 
-def _world_states(path: Path) -> list[Any]:
-    """Every state of the world in truth.mcap, in order of time."""
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # the world's channel is in no table of the drones
-            messages = [message for _, _, message in read(path)]
-        states = [world_state_t.decode(m) if isinstance(m, bytes) else m for m in messages]
-    except (LogError, ValueError) as error:
-        raise EvidenceError(
-            f"the simulator's truth cannot be read, so nothing can be judged: {error}"
-        ) from error
+def _world_states(path: Path) -> tuple[list[Any], list[str]]:
+    """(every state of the world in truth.mcap, in order of time; what of it could not be read)."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        try:
+            messages = [message for _, _, message in read(path, channels=channels.WORLD_STATE)]
+        except LogError as error:
+            raise EvidenceError(
+                f"the simulator's truth cannot be read, so nothing can be judged: {error}"
+            ) from error
+    states = [message for message in messages if not isinstance(message, bytes)]
     if not states:
         raise EvidenceError(f"{path}: holds no state of the world, so nothing can be judged; fly again")
-    return sorted(states, key=lambda state: int(state.utime))
+    return sorted(states, key=lambda state: int(state.utime)), [
+        f"truth: {warning.message}" for warning in caught
+    ]
 
 
 def _tracks(rows: Iterable[tuple[int, int, tuple[float, ...]]], shape: tuple[int, int]) -> dict[int, Array]:

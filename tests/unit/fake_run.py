@@ -73,8 +73,8 @@ class FakeRun:
 
     def animal(self, animal: int, t_s: float) -> tuple[float, float, float]:
         """(n, e, heading) of an animal: 15 m apart round the pod's middle, each on a circle of 3 m."""
-        place = 2 * np.pi * animal / self.n_animals
-        reach = 0.0 if self.n_animals == 1 else 7.5 / np.sin(np.pi / self.n_animals)
+        place = 2 * np.pi * animal / max(self.n_animals, 1)
+        reach = 0.0 if self.n_animals < 2 else 7.5 / np.sin(np.pi / self.n_animals)
         turn = 0.1 * t_s + animal
         return (
             100 + reach * np.cos(place) + 3 * np.sin(turn),
@@ -204,7 +204,7 @@ class FakeRun:
     def _write_truth(self, folder: Path) -> None:
         writer = LogWriter(folder / "truth.mcap", drone_id=0)
         for seq, t_s in enumerate(np.arange(0, self.duration_s, 0.05)):
-            writer.write("WORLD_STATE", self._world(seq, float(t_s)).encode(), round(t_s * 1e6))
+            writer.write(channels.WORLD_STATE, self._world(seq, float(t_s)).encode(), round(t_s * 1e6))
         writer.close()
         about = {
             "seed": self.seed,
