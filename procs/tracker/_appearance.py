@@ -46,7 +46,9 @@ class Appearance:
         """
         self.water = water_colour(lab, outside)
         contrast = np.abs(lab.astype(np.float32) - self.water).reshape(-1, 3)
-        self._range = np.maximum(np.percentile(contrast, RANGE_PERCENTILE, axis=0), MIN_RANGE).astype(np.float32)
+        self._range = np.maximum(np.percentile(contrast, RANGE_PERCENTILE, axis=0), MIN_RANGE).astype(
+            np.float32
+        )
         index = self._index(lab)
         self._inside, self._outside = _separate(index, prior, outside)
         self._anchor = self._inside.copy()
@@ -70,7 +72,8 @@ class Appearance:
 
     def _index(self, lab: Image) -> NDArray[np.intp]:
         levels = np.arange(256, dtype=np.float32)[:, None]
-        # Fine bins near the water's colour, coarse ones for foam and glint: black whales on black water differ little.
+        # Fine bins near the water's colour, coarse ones for foam and glint: black whales on black water
+        # differ little.
         table = np.minimum(BINS / 2 * (1 + np.tanh((levels - self.water) / self._range)), BINS - 1)
         table = (table.astype(np.intp) * np.array([BINS * BINS, BINS, 1])).astype(np.intp)
         return np.asarray(table[:, 0][lab[..., 0]] + table[:, 1][lab[..., 1]] + table[:, 2][lab[..., 2]])

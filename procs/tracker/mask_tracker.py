@@ -31,7 +31,7 @@ from procs.tracker._checks import (
     check_point,
 )
 from procs.tracker._first_look import Companion, FirstLook, first_look, in_frame
-from procs.tracker._look import LEAST_SEPARATION, Look, Reference, find_again, look_for_companion, take_look
+from procs.tracker._look import Look, Reference, find_again, look_for_companion, take_look
 from procs.tracker._motion import Motion
 from procs.tracker._pod import refreshed
 from procs.tracker._sight import Sight, outline_of
@@ -123,7 +123,7 @@ class MaskTracker:
         companions_there = self._as_companions(others, 0.0)
         self._companions = [other.body for other in companions_there]
         first = first_look(image, at, own_box, companions_there)
-        if first is None or first.sight.separation < LEAST_SEPARATION:
+        if first is None:
             return self._unseen_track()
         return self._adopt(first)
 
@@ -204,7 +204,7 @@ class MaskTracker:
         inside = np.clip(centre, 0, [width - 1, height - 1])
         others = fresh if fresh is not None else [Companion(other, None) for other in self._companions]
         first = first_look(image, inside, box, others)
-        if first is not None and first.sight.separation >= LEAST_SEPARATION:
+        if first is not None:
             return self._adopt(first)
         if self._state != "tracking":
             self._motion.jump(centre)
