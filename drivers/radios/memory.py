@@ -9,6 +9,8 @@ if TYPE_CHECKING:
 
 __all__ = ["MemoryEther", "MemoryRadio"]
 
+MAX_WAITING = 1000  # datagrams; a socket's buffer is not endless either
+
 Deliver = Callable[[float, Callable[[], None]], None]
 
 
@@ -96,7 +98,7 @@ class MemoryRadio:
 
     def arrive(self, data: bytes) -> None:
         """The ether brings a datagram."""
-        if self._is_open:
+        if self._is_open and len(self._waiting) < MAX_WAITING:
             self._waiting.append(data)
             self._callback()
 

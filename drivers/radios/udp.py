@@ -55,12 +55,12 @@ class UdpRadio:
     def receive(self) -> list[bytes]:
         """All datagrams that wait, at most 200; never blocks."""
         datagrams: list[bytes] = []
-        while len(datagrams) < MAX_BATCH:
+        for _ in range(MAX_BATCH):
             try:
                 datagrams.append(self._socket.recv(MAX_DATAGRAM_BYTES))
             except BlockingIOError:
                 break
-            except OSError:  # an earlier send met a closed port; the datagrams behind it are still there
+            except ConnectionError:  # a send met a closed port; what waits behind that word is still there
                 continue
         return datagrams
 

@@ -107,6 +107,8 @@ class RelayShell:
             " and ".join(self._core.silent_sides(now_us)),
             "silent link to the living neighbour on the",
         )
+        lost = self._core.members.lost(now_us)
+        self._tell("lost", ", ".join(str(member) for member in lost), "lost drones")
 
     def _tell(self, cause: str, what: str, intro: str) -> None:
         if what:
@@ -123,8 +125,8 @@ def setup(runtime: Runtime) -> None:
         fleet_key = read_key(key_path(runtime.settings.run_dir, mission.radio.key_file))
     except FleetKeyError as error:
         raise RuntimeFailure(str(error)) from error
-    radio = runtime.open("radio")
     try:
+        radio = runtime.open("radio")
         core = Relay(
             own_id=runtime.drone_id,
             roster=mission.roster,
@@ -136,7 +138,7 @@ def setup(runtime: Runtime) -> None:
             lost_after_s=mission.radio.lost_after_s,
             now_us=runtime.utime,
         )
-    except ValueError as error:
+    except (ValueError, OSError) as error:
         raise RuntimeFailure(str(error)) from error
     shell = RelayShell(runtime, radio, core)
     for channel in channels.CROSSING:

@@ -21,15 +21,17 @@ from procs.relay.fleet import TABLE_LIMIT_BYTES, FleetTable
 from procs.relay.link import LINK_KIND, Link
 from procs.relay.members import BOAT_ID, Members, Neighbours
 from procs.relay.rows import Marker, Row
-from procs.relay.seal import OVERHEAD_BYTES, Refusal, RefusedError, Sessions
+from procs.relay.seal import MAX_OVERHEAD_BYTES, Refusal, RefusedError, Sessions
 
-__all__ = ["ENCODED_LIMIT_BYTES", "TICK_S", "Copy", "Relay"]
+__all__ = ["DATAGRAM_LIMIT_BYTES", "ENCODED_LIMIT_BYTES", "MAX_MEMBERS", "TICK_S", "Copy", "Relay"]
 
 TICK_S = 0.25
 TICKS_PER_TABLE = 2
 TICKS_PER_HELLO = 4
 HELLOS = 4  # lost members called at each such tick, in turn
-ENCODED_LIMIT_BYTES = 400  # of one message; with header and seal it stays within 500
+ENCODED_LIMIT_BYTES = 400  # of one message as LCM encodes it
+DATAGRAM_LIMIT_BYTES = 500
+MAX_MEMBERS = 63  # drones in the roster: the bitmap of fleet_state_t is an int64
 ROW_BYTES = 22
 
 Send = Callable[[int, bytes], bool]
@@ -67,6 +69,8 @@ class Relay:
             raise ValueError(
                 f"the radio has no address for drones {missing} of the roster {roster}; add them to its peers"
             )
+        if len(roster) > MAX_MEMBERS:
+            raise ValueError(f"a roster of {len(roster)} drones: a fleet has at most {MAX_MEMBERS}; fly two")
         self.own_id = own_id
         self.members = Members(own_id, roster, lost_after_s, now_us)
         self.sessions = Sessions(fleet_key, own_id, session, self.members.ids)
@@ -80,6 +84,8 @@ class Relay:
             for peer_id in self.members.ids
             if peer_id != own_id and peer_id in reachable
         }
+        head = MAX_OVERHEAD_BYTES + datagram.HEAD.size + len(self.members.ids) + 1
+        self.encoded_limit_bytes = min(ENCODED_LIMIT_BYTES, DATAGRAM_LIMIT_BYTES - head)
         self._n_ticks = 0
         self._hello_turn = 0
 
@@ -108,8 +114,10 @@ class Relay:
         """
         if not channel.crosses:
             raise ValueError(f"{channel.name} may not cross the ring (lcmtypes/channels.py)")
-        if len(data) > ENCODED_LIMIT_BYTES:
-            raise ValueError(f"{channel.name} of {len(data)} bytes: at most {ENCODED_LIMIT_BYTES} may cross")
+        if len(data) > self.encoded_limit_bytes:
+            raise ValueError(
+                f"{channel.name} of {len(data)} bytes: at most {self.encoded_limit_bytes} may cross"
+            )
         message = Message(channel, data, utime, payload_bytes)
         for peer_id in self.members.neighbours(now_us).ids:
             self.links[peer_id].queue.offer(message)
@@ -213,7 +221,7 @@ class Relay:
     def _own_bytes_per_s(self, bytes_per_s: int) -> int:
         """What the relay's own datagrams need on one link, at most half of the cap."""
         n_members = len(self.members.ids)
-        link_bytes = OVERHEAD_BYTES + datagram.HEAD.size + n_members + datagram.CLOCK_PART.size
+        link_bytes = MAX_OVERHEAD_BYTES + datagram.HEAD.size + n_members + datagram.CLOCK_PART.size
         table_bytes = min(TABLE_LIMIT_BYTES, n_members * ROW_BYTES)
         ticks_per_s = round(1 / TICK_S)
         tables_per_s = ticks_per_s if table_bytes == TABLE_LIMIT_BYTES else ticks_per_s // TICKS_PER_TABLE
@@ -253,7 +261,7 @@ class Relay:
         link's part through."""
         plain = datagram.pack(body)
         is_message = body.message is not None
-        if not link.window.fits(len(plain) + OVERHEAD_BYTES, is_message, now_us):
+        if not link.window.fits(len(plain) + MAX_OVERHEAD_BYTES, is_message, now_us):
             if body.table is None:
                 return False
             return self._send(link, datagram.Body(body.stamp_us, body.ages, body.clock), kind, 0, 0, now_us)

@@ -26,7 +26,7 @@ from cryptography.hazmat.primitives.ciphers.aead import ChaCha20Poly1305
 from cryptography.hazmat.primitives.hashes import SHA256
 from cryptography.hazmat.primitives.kdf.hkdf import HKDF
 
-__all__ = ["OVERHEAD_BYTES", "Opened", "Refusal", "RefusedError", "ReplayWindow", "Sessions"]
+__all__ = ["MAX_OVERHEAD_BYTES", "Opened", "Refusal", "RefusedError", "ReplayWindow", "Sessions"]
 
 VERSION = 1
 HEADER = struct.Struct(">BBQI")  # version, sender, session, counter
@@ -34,6 +34,7 @@ TAG_BYTES = 16
 PROOF_BYTES = 8  # of a challenge and of its echo
 HAS_CHALLENGE, HAS_ECHO = 1, 2
 OVERHEAD_BYTES = HEADER.size + 1 + TAG_BYTES  # of a datagram between proven sessions
+MAX_OVERHEAD_BYTES = OVERHEAD_BYTES + 2 * PROOF_BYTES  # while one of them is not
 WINDOW_BITS = 64
 # Unproven sessions remembered for each peer; without a limit recorded datagrams could use up the memory.
 MAX_CANDIDATES = 4
