@@ -28,11 +28,11 @@ class MavlinkUdp:
 
     def __init__(self, listen: str, system_id: int = 0) -> None:
         self.system_id = system_id
+        address = _split(listen)
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
-        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
-            self._socket.bind(_split(listen))
+            self._socket.bind(address)
         except OSError as error:
             self._socket.close()
             raise OSError(
@@ -76,8 +76,9 @@ class MavlinkUdpClient(MavlinkUdp):
     """Sends first, to a known address."""
 
     def __init__(self, remote: str, system_id: int = 0) -> None:
+        address = _split(remote)
         super().__init__("0.0.0.0:0", system_id)
-        self._peer = _split(remote)
+        self._peer = address
 
 
 class MavlinkTcp:

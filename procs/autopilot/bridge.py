@@ -25,6 +25,7 @@ SILENT_POSITION_US = 3_000_000  # after which the streams are asked for again
 GROUND_SILENCE_S = 10.0
 FENCE_MARGIN_M = 20.0  # of the autopilot's own fence beyond ours, which acts first
 LARGEST_CIRCLE_M = 10_000.0  # that ArduCopter's fence takes
+FENCE_HEIGHT, FENCE_CIRCLE = 1.0, 2.0  # bits of FENCE_TYPE
 NEVER_HEARD_MS = 2**31 - 1
 
 
@@ -48,7 +49,9 @@ class Bridge:
         self.flyer = Flyer(drone_id, mission.limits, self.telemetry, self._send_setpoint)
         self._codec = Codec(system_id, mavlink.MAV_COMP_ID_MISSIONPLANNER)
         self._streams = Streams(STREAMS_HZ)
-        self._parameters = Parameters(_wishes(mission, drone_id, system_id))
+        self._parameters = Parameters(
+            _failsafes(mission, drone_id, system_id), preferred=_speeds(mission.limits)
+        )
         self._heartbeat_due_us = LONG_AGO_US
         self._streams_asked_us = 0
         self._foreign_system = 0
@@ -192,26 +195,25 @@ class Bridge:
         )
 
 
-def _wishes(mission: Mission, drone_id: int, system_id: int) -> list[tuple[tuple[str, float], ...]]:
-    """The parameters that the bridge sets, with the names and units of other versions (fact 14)."""
+def _failsafes(mission: Mission, drone_id: int, system_id: int) -> list[tuple[tuple[str, float], ...]]:
+    """The parameters without which the autopilot would not guard itself, in the names of all versions (fact 14)."""
     limits = mission.limits
     home = mission.home(drone_id)
     # The autopilot's circle is round its home, ours round the fleet's origin: wide enough to hold ours.
     radius_m = limits.fence_radius_m + math.hypot(home.home_n_m, home.home_e_m) + FENCE_MARGIN_M
-    circle = 2.0 if radius_m <= LARGEST_CIRCLE_M else 0.0
+    circle = FENCE_CIRCLE if radius_m <= LARGEST_CIRCLE_M else 0.0
     return [
         (("MAV_GCS_SYSID", float(system_id)), ("SYSID_MYGCS", float(system_id))),
         (("FS_GCS_ENABLE", 1.0),),
         (("FS_GCS_TIMEOUT", GROUND_SILENCE_S),),
-        (("FENCE_TYPE", 1.0 + circle),),
+        (("FENCE_TYPE", FENCE_HEIGHT + circle),),
         (("FENCE_RADIUS", min(radius_m, LARGEST_CIRCLE_M)),),
         (("FENCE_ALT_MAX", limits.max_height_m + FENCE_MARGIN_M),),
         (("FENCE_ENABLE", 1.0),),
-        *_speed_wishes(limits),
     ]
 
 
-def _speed_wishes(limits: LimitSettings) -> list[tuple[tuple[str, float], ...]]:
+def _speeds(limits: LimitSettings) -> list[tuple[tuple[str, float], ...]]:
     """The autopilot's own speeds, which RTL and LAND fly with: m/s in new versions, cm/s in old ones."""
     speeds = (("", limits.speed_m_s), ("_UP", limits.climb_m_s), ("_DN", limits.descent_m_s))
     return [((f"WP_SPD{axis}", speed), (f"WPNAV_SPEED{axis}", 100 * speed)) for axis, speed in speeds]

@@ -33,7 +33,7 @@ Write = Callable[[int, Vector, Vector, float, int], None]
 
 
 class Flyer:
-    """Turns the newest live setpoint into commands and into `write(mask, local place, velocity, yaw, utime)`."""
+    """Turns the newest live setpoint into commands and `write(mask, local place, velocity, yaw, utime)`."""
 
     def __init__(self, drone_id: int, limits: LimitSettings, telemetry: Telemetry, write: Write) -> None:
         self.drone_id = drone_id

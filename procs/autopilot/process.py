@@ -50,17 +50,15 @@ class Autopilot:
             runtime.degraded(problem, cause="autopilot")
         else:
             runtime.ok("autopilot")
-        n_refused, self._n_refused = (
-            self._bridge.flyer.n_refused - self._n_refused,
-            self._bridge.flyer.n_refused,
-        )
-        if n_refused:
+        n_refused = self._bridge.flyer.n_refused
+        if n_refused > self._n_refused:
             runtime.degraded(
                 f"{n_refused} setpoints refused: not finite, of unknown kind or for another drone",
                 cause="refused",
             )
         else:
             runtime.ok("refused")
+        self._n_refused = n_refused
 
     def close(self) -> None:
         """Stop the vehicle, then the link."""

@@ -112,6 +112,7 @@ class _Wish:
     """A parameter under the names that versions give it, the newest first; units differ too."""
 
     names: tuple[tuple[str, float], ...]
+    is_needed: bool
     name_index: int = 0
     attempts: int = 0
     next_us: int = 0
@@ -120,15 +121,22 @@ class _Wish:
 
 
 class Parameters:
-    """Sets parameters, under the names of other versions too, and knows what was not set."""
+    """Sets parameters, under the names of other versions too, and knows which of the needed ones was not set.
 
-    def __init__(self, wishes: Sequence[tuple[tuple[str, float], ...]]) -> None:
-        self._wishes = [_Wish(tuple(names)) for names in wishes]
+    needed, preferred: for each parameter its (name, value) in each version of the autopilot.
+    """
+
+    def __init__(
+        self,
+        needed: Sequence[tuple[tuple[str, float], ...]],
+        preferred: Sequence[tuple[tuple[str, float], ...]] = (),
+    ) -> None:
+        self._wishes = [_Wish(names, True) for names in needed] + [_Wish(names, False) for names in preferred]
         self._begun = False
 
     def restart(self, utime: int) -> None:
         """Set all again."""
-        self._wishes = [_Wish(wish.names, next_us=utime) for wish in self._wishes]
+        self._wishes = [_Wish(wish.names, wish.is_needed, next_us=utime) for wish in self._wishes]
         self._begun = True
 
     def due(self, utime: int) -> list[tuple[str, float]]:
@@ -156,10 +164,10 @@ class Parameters:
                     wish.refused = "" if wish.is_set else f"{name} is {value:g}, wanted {wanted:g}"
 
     def problem(self) -> str:
-        """What could not be set, for people; empty while it is still being tried."""
+        """What is needed and could not be set, for people; empty while it is still being tried."""
         texts = [
             wish.refused or f"{wish.names[0][0]} got no answer"
             for wish in self._wishes
-            if not wish.is_set and wish.name_index == len(wish.names)
+            if wish.is_needed and not wish.is_set and wish.name_index == len(wish.names)
         ]
         return ", ".join(texts)
