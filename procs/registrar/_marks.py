@@ -93,8 +93,8 @@ def check_boxes(boxes: ArrayLike, name: str) -> Array:
         )
     for row in np.flatnonzero((array[:, 2] < array[:, 0]) | (array[:, 3] < array[:, 1])):
         raise ValueError(
-            f"{name} row {row} is {array[row].tolist()}: right must not be less than left, nor bottom than top; "
-            "order the edges as left, top, right, bottom"
+            f"{name} row {row} is {array[row].tolist()}: edges must stand as left, top, right, bottom; "
+            "right must not be less than left, nor bottom less than top"
         )
     return array
 

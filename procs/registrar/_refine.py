@@ -19,6 +19,7 @@ Ints = NDArray[np.intp]
 # that moved.
 SIGMAS = (0.8, 0.4, 0.2, 0.1, 0.06)
 SIGMA_PRICES = (12.0, 8.0, 3.0, 0.0, 0.0)  # nats: most views of one instant agree within a tenth of a body
+KEPT_AFTER = (20, 10, 8, 6, 6)  # starting points that go on to the next sigma
 FITS_PER_SIGMA = 2
 SHEAR_STD = 0.07  # of what two tilted cameras shear, as a share of the scale
 PERSPECTIVE_STD = 0.16  # of the perspective terms of two tilted cameras, over the width of a view
@@ -125,7 +126,7 @@ def _compose(parameters: Array) -> Array:
 def refine(pair: Pair, homographies: Array) -> list[Candidate]:
     """Distinct matchings from starting similarities (K, 3, 3), by falling log evidence."""
     best: dict[tuple[int, ...], Candidate] = {}
-    for level, price in zip(SIGMAS, SIGMA_PRICES, strict=True):
+    for level, price, n_kept in zip(SIGMAS, SIGMA_PRICES, KEPT_AFTER, strict=True):
         sigma = np.full(len(homographies), level)
         for _ in range(FITS_PER_SIGMA):
             gains, _ = _evaluate(pair, homographies, sigma)
@@ -145,4 +146,5 @@ def refine(pair: Pair, homographies: Array) -> list[Candidate]:
                 best[key] = Candidate(
                     columns[index], float(scores[index]), homographies[index], gains[index], level
                 )
+        homographies = homographies[np.argsort(-scores, kind="stable")[:n_kept]]
     return sorted(best.values(), key=lambda one: -one.score)

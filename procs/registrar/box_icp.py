@@ -26,6 +26,8 @@ Ints = NDArray[np.intp]
 
 HEADING_PRIOR_STD_RAD = float(np.deg2rad(8.0))  # two compasses of 5 degrees and a little
 CONFIDENCE_TEMPERATURE = 1.6  # margins are over-confident by about this factor: boxes err together
+# Log evidence that views of different pods of 3 animals reach by chance, and what each of two more adds.
+UNRELATED_SCORE, UNRELATED_PER_BOX = 2.0, 3.0
 AMBIGUOUS_MARGIN = 2.2  # nats; a rival matching this near is as good as the answer
 
 
@@ -193,6 +195,10 @@ def _judge(candidates: list[Candidate]) -> tuple[float, bool]:
     ]
     swaps, lone = _exchange_margins(best)
     everything = np.concatenate([margins, swaps, lone])
+    # With fewer boxes nothing could tell different pods apart; two drones over one pod are taken at that.
+    if (n_boxes := min(best.gains.shape)) >= 3:
+        unrelated = UNRELATED_SCORE + UNRELATED_PER_BOX * (min(n_boxes, 5) - 3)
+        everything = np.append(everything, best.score - unrelated)
     rivals = np.exp(-np.maximum(everything, 0.0) / CONFIDENCE_TEMPERATURE).sum()
     nearest = min([np.inf, *contradicting, *swaps])
     return float(1 / (1 + rivals)), bool(nearest < AMBIGUOUS_MARGIN)

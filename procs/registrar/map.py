@@ -148,8 +148,9 @@ def _encode_animal(animal: MapAnimal, origin_n_m: float, origin_e_m: float) -> b
     north, east = animal.n_m - origin_n_m, animal.e_m - origin_e_m
     if not (abs(north) <= REACH_M and abs(east) <= REACH_M and 0 <= animal.size_m <= MAX_SIZE_M):
         raise ValueError(
-            f"animal {animal.id} at ({north:.1f}, {east:.1f}) m from the map's origin, size {animal.size_m:.1f} m: "
-            f"must be within {REACH_M} m and no longer than {MAX_SIZE_M} m; leave it out of the map"
+            f"animal {animal.id} at ({north:.1f}, {east:.1f}) m from the map's origin, "
+            f"size {animal.size_m:.1f} m: must be within {REACH_M} m and no longer than "
+            f"{MAX_SIZE_M} m; leave it out of the map"
         )
     if not (
         0 <= animal.id <= NO_ID and 0 <= animal.hits <= COUNTER_LIMIT and 0 <= animal.misses <= COUNTER_LIMIT
