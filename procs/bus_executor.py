@@ -113,6 +113,9 @@ class BusRuntime(Runtime):
         signal.set_wakeup_fd(self._wake_write)
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, self._signalled)
+        self._now = self._clock.utime()
+        for timer in self._timers:  # a slow setup is no lateness
+            timer.due_utime = self._now + timer.period_us
         self.every(HEARTBEAT_PERIOD_S, self._beat)
         self._beat()
         while self._running:
@@ -138,12 +141,13 @@ class BusRuntime(Runtime):
         )
 
     def _drain(self) -> None:
-        """Take everything out of LCM's queue, so that it never fills."""
+        """Take what waits out of LCM's queue, so that it never fills."""
         self._now = self._clock.utime()
         if self._wake_read in self._ready:
             os.read(self._wake_read, 1024)
-        while self._running and self._lcm.handle_timeout(0) > 0:
-            pass
+        for _ in range(C_QUEUE_CAPACITY):  # a flood that never ends must not keep the timers waiting
+            if not self._running or self._lcm.handle_timeout(0) <= 0:
+                break
         if self._raw and self._raw_handler is not None:
             raw, self._raw = self._raw, []
             self._counts["handled"] += len(raw)

@@ -150,6 +150,9 @@ class QueueRuntime(Runtime):
         """End cleanly."""
         self._began_us = self._queue.now_us
         self._stop()
+        said, self._said = self._said, []
+        for channel, data in said:
+            self._bus.deliver(channel, data)
         self.kill()
 
     def message_arrived(self, subscription: Subscription, data: bytes) -> None:
@@ -163,6 +166,7 @@ class QueueRuntime(Runtime):
         self._counts["handled"] += 1
         assert self._raw_handler is not None
         self._raw_handler(channel, data, self.utime)
+        self._flush(self._compute_us)
 
     def _listen(self, subscription: Subscription) -> None:
         self._bus.listen(self, subscription)
@@ -233,6 +237,8 @@ class QueueRuntime(Runtime):
         bus = self._bus
 
         def arrive() -> None:
+            if not self._alive:  # killed while it still computed
+                return
             for channel, data in said:
                 bus.deliver(channel, data)
 

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from lcmtypes import channels, make
 from lcmtypes.podwatch import heartbeat_t
+from logs.sequence import GapCounter
 from procs.settings import DroneSettings
 
 if TYPE_CHECKING:
@@ -25,8 +26,6 @@ __all__ = ["DEFAULT_CAPACITY", "HEARTBEAT_PERIOD_S", "RawHandler", "Runtime", "R
 
 DEFAULT_CAPACITY = 30
 HEARTBEAT_PERIOD_S = 1.0
-# Every message begins with its fingerprint, utime (int64) and seq (int32), big-endian.
-SEQ_OFFSET = 16
 
 Handler = Callable[[Any], None]
 RawHandler = Callable[[str, bytes, int], None]
@@ -51,7 +50,6 @@ class Subscription:
     newest: bool
     capacity: int
     waiting: deque[tuple[int, bytes]] = field(default_factory=deque)  # (order of arrival, encoded message)
-    last_seq: int | None = None
     n_heard: int = 0
     heard_at_beat: int = 0
 
@@ -79,8 +77,8 @@ class Runtime(ABC):
         self._sequence: dict[str, int] = {}
         self._arrivals = 0
         self._trouble: dict[str, str] = {}
-        self._status = heartbeat_t.OK
-        self._counts = {"gaps": 0, "dropped": 0, "bad": 0, "handled": 0}
+        self._gaps = GapCounter()
+        self._counts = {"dropped": 0, "bad": 0, "handled": 0}
         self._late_us = 0
 
     # What a shell uses.
@@ -187,11 +185,7 @@ class Runtime(ABC):
     def _arrive(self, subscription: Subscription, data: bytes) -> None:
         """Queue one message, dropping the oldest beyond the capacity."""
         subscription.n_heard += 1
-        if len(data) >= SEQ_OFFSET + 4:
-            (seq,) = struct.unpack_from(">i", data, SEQ_OFFSET)
-            if subscription.last_seq is not None and seq > subscription.last_seq + 1:
-                self._counts["gaps"] += seq - subscription.last_seq - 1
-            subscription.last_seq = seq
+        self._gaps.see(subscription.channel, data)
         self._arrivals += 1
         subscription.waiting.append((self._arrivals, data))
         while len(subscription.waiting) > subscription.capacity:
@@ -253,7 +247,7 @@ class Runtime(ABC):
                 late_ms=self._late_us / 1000,
                 cpu=cpu,
                 memory_mb=memory_mb,
-                n_gaps=self._counts["gaps"],
+                n_gaps=self._gaps.n_lost,
                 n_dropped=self._counts["dropped"],
                 n_bad=self._counts["bad"],
                 n_rates=len(heard),
