@@ -196,7 +196,7 @@ class Bridge:
 
 
 def _failsafes(mission: Mission, drone_id: int, system_id: int) -> list[tuple[tuple[str, float], ...]]:
-    """The parameters without which the autopilot would not guard itself, in the names of all versions (fact 14)."""
+    """The parameters by which the autopilot guards itself, in the names of all versions (fact 14)."""
     limits = mission.limits
     home = mission.home(drone_id)
     # The autopilot's circle is round its home, ours round the fleet's origin: wide enough to hold ours.
