@@ -100,9 +100,12 @@ class SharedFrames:
             descriptor = os.open(SHARED_FOLDER / name, os.O_RDONLY)
         except OSError:
             return False
-        size = os.fstat(descriptor).st_size
-        self._map = mmap.mmap(descriptor, size, prot=mmap.PROT_READ)
-        os.close(descriptor)
+        try:
+            self._map = mmap.mmap(descriptor, 0, prot=mmap.PROT_READ)
+        except (OSError, ValueError):  # empty: made, not yet sized
+            return False
+        finally:
+            os.close(descriptor)
         self._name = name
         return True
 

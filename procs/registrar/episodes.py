@@ -50,8 +50,11 @@ class EpisodeBook:
         self._roster = roster
         self._began_utime = began_utime
         self.newest: Proposal | None = None
+        self._was_contradicted = False
 
-    def propose(self, members: tuple[int, ...], utime: int, fleet_utime: int, *, fresh: bool = False) -> Proposal | None:
+    def propose(
+        self, members: tuple[int, ...], utime: int, fleet_utime: int, *, fresh: bool = False
+    ) -> Proposal | None:
         """A new episode among `members`, or None while one should run, or while this drone still listens."""
         if utime - self._began_utime < LISTEN_FIRST_US or self._drone_id not in members:
             return None
@@ -66,14 +69,17 @@ class EpisodeBook:
             return False
         proposal = Proposal(message.number, message.proposer, members, message.t_utime, message.fresh)
         if self.newest is not None and proposal.key <= self.newest.key:
+            # Who says an older one was away when the newest was said: it is told at the next chance.
+            self._was_contradicted = self._was_contradicted or proposal.key < self.newest.key
             return False
         self.newest = proposal
         return True
 
     def saying(self, fleet_utime: int) -> episode_t | None:
-        """What to say now; None once the newest is long over."""
+        """What to say now; None once the newest is long over and nobody says an older one."""
         proposal = self.newest
-        if proposal is None or fleet_utime > proposal.t_utime + REPEAT_AFTER_T_US:
+        is_asked, self._was_contradicted = self._was_contradicted, False
+        if proposal is None or (fleet_utime > proposal.t_utime + REPEAT_AFTER_T_US and not is_asked):
             return None
         return make(
             episode_t,

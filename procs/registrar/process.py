@@ -46,6 +46,7 @@ class RegistrarShell:
         )
         self._poses = PoseHistory()
         self._fleet_offset_us = 0
+        self._fleet_time_ok = True  # a drone without a relay is a fleet of one
         self._living: tuple[int, ...] = (runtime.drone_id,)
         self._wants_episode = False
 
@@ -62,6 +63,7 @@ class RegistrarShell:
     def on_fleet(self, state: fleet_state_t) -> None:
         """Members and fleet time; a member that is lost leaves the running episode."""
         self._fleet_offset_us = state.fleet_offset_us
+        self._fleet_time_ok = state.fleet_time_ok
         living = from_bitmap(state.members, self._roster)
         for lost in [member for member in self._living if member not in living]:
             self._registrar.drop_member(lost)
@@ -73,13 +75,13 @@ class RegistrarShell:
             [[box.left_px, box.top_px, box.right_px, box.bottom_px] for box in message.boxes], dtype=float
         ).reshape(-1, 4)
         if not np.isfinite(boxes).all():
-            self._runtime.degraded("DETECTIONS holds a box that is not a number; the frame is left out", cause="nan")
+            self._runtime.degraded(
+                "DETECTIONS holds a box that is not a number; the frame is left out", cause="nan"
+            )
             return
         self._runtime.ok("nan")
         pose = self._poses.at(message.utime)
-        taken = self._registrar.detected(
-            message.utime, boxes, pose, message.utime + self._fleet_offset_us
-        )
+        taken = self._registrar.detected(message.utime, boxes, pose, message.utime + self._fleet_offset_us)
         if taken is None or pose is None:
             return
         sighting, residual = taken
@@ -143,7 +145,7 @@ class RegistrarShell:
     def step(self) -> None:
         """Propose, go on with the episode, repeat what is known."""
         runtime, registrar = self._runtime, self._registrar
-        if self._wants_episode:
+        if self._wants_episode and self._fleet_time_ok:  # an instant in another time would suit nobody
             registrar.propose(self._living, runtime.utime, self._fleet_utime)
         said = registrar.book.saying(self._fleet_utime)
         if said is not None:

@@ -19,10 +19,14 @@ def bus_url(drone_id: int, slot: int) -> str:
 
 
 class Slot:
-    """The lowest slot that nobody holds; free again when closed or when its process ends."""
+    """The lowest slot that nobody holds; free again when it is closed, here and in whoever inherited its lock."""
 
     def __init__(self) -> None:
         self.number, self._file = _lock_lowest()
+
+    def fileno(self) -> int:
+        """The lock's file descriptor."""
+        return self._file.fileno()
 
     def close(self) -> None:
         self._file.close()

@@ -18,7 +18,7 @@ from procs import processes
 from procs.settings import DriverSpec, DroneSettings
 from tools.sim.buses import Slot, bus_url, free_udp_ports
 from tools.sim.plan import RunPlan
-from tools.sim.supervision import Supervisor, program
+from tools.sim.supervision import Supervisor, SupervisorError, program
 from tools.sim.watch import Watch
 from tools.sim.world_process import COMMAND_CHANNEL
 
@@ -36,20 +36,23 @@ class ProcessFleet:
     def __init__(self, plan: RunPlan, watch: Watch) -> None:
         self.plan = plan
         self._watch = watch
-        self._run = secrets.token_hex(4)
         self._slot = Slot()
+        # Named by the slot, which nobody else holds now: what an earlier run there left behind is known as such.
+        prefix = f"podwatch_s{self._slot.number}x"
+        _remove(prefix)
+        self._run = f"s{self._slot.number}x{secrets.token_hex(4)}"
         roster = plan.mission.roster
         ports = free_udp_ports(3 * len(roster))
         self._mavlink_ports = dict(zip(roster, ports, strict=False))
         self._radio_ports = dict(zip(roster, ports[len(roster) :], strict=False))
         self._ether_ports = dict(zip(roster, ports[2 * len(roster) :], strict=False))
-        self._page_path = SHARED_FOLDER / f"podwatch_{self._run}_clock"
-        self._page = ClockPage(self._page_path, create=True)
         self._heard: set[str] = set()
         self._world = lcm.LCM(world_url(self._slot.number))
         self._buses = [self._listen(drone_id) for drone_id in roster]
+        self._page_path = SHARED_FOLDER / f"podwatch_{self._run}_clock"
+        self._page = ClockPage(self._page_path, create=True)
         self._write_settings()
-        self.supervisor = Supervisor(plan.folder, roster)
+        self.supervisor = Supervisor(plan.folder, roster, self._slot.fileno())
         self._next_check = 0.0
 
     def __enter__(self) -> "ProcessFleet":
@@ -67,9 +70,16 @@ class ProcessFleet:
         """Until every process has beaten once; then the simulation clock begins. Raises SupervisorError."""
         wanted = {program(d, p.name) for d in self.plan.mission.roster for p in processes.PROCESSES}
         limit = time.monotonic() + START_LIMIT_S
-        while not wanted <= self._heard and time.monotonic() < limit:
+        while self._page.read()[1] == 0:
+            missing = sorted(wanted - self._heard) or ["world"]
+            if time.monotonic() > limit:
+                raise SupervisorError(
+                    f"{', '.join(missing)}: not ready within {START_LIMIT_S:.0f} s; is the machine too busy? "
+                    f"What they said is in {self.plan.folder / 'output'}"
+                )
+            if missing == ["world"]:  # again and again, as the world may not listen yet
+                self._command(kind="go")
             self.look()
-        self._command(kind="go")
 
     def look(self) -> None:
         """Hear what waits on the buses; now and then see whether the tree still stands."""
@@ -84,8 +94,7 @@ class ProcessFleet:
     def close(self) -> None:
         """Stop all in order; leave nothing in shared memory."""
         self.supervisor.stop()
-        for leftover in SHARED_FOLDER.glob(f"podwatch_{self._run}_*"):
-            leftover.unlink(missing_ok=True)
+        _remove(f"podwatch_{self._run}_")
         self._slot.close()
 
     def dive(self, on: bool) -> None:
@@ -196,3 +205,9 @@ class ProcessFleet:
             log_path=str(self.plan.log_path(drone_id)),
             drivers={name: DriverSpec(driver=driver, options=options) for name, (driver, options) in specs.items()},
         )
+
+
+def _remove(prefix: str) -> None:
+    """Take out of shared memory all that is named so."""
+    for leftover in SHARED_FOLDER.glob(f"{prefix}*"):
+        leftover.unlink(missing_ok=True)

@@ -84,7 +84,8 @@ def _common(folder: Path, name: str) -> dict[str, str]:
 class Supervisor:
     """One supervisord with its tree; ends with the process that made it."""
 
-    def __init__(self, folder: Path, roster: tuple[int, ...]) -> None:
+    def __init__(self, folder: Path, roster: tuple[int, ...], lock: int) -> None:
+        """`lock`: a file descriptor that supervisord holds open for as long as it runs."""
         self._output = folder / "output"
         self._output.mkdir(exist_ok=True)
         # A socket's path holds at most 107 bytes, and a run's folder may be deep.
@@ -93,13 +94,15 @@ class Supervisor:
         path = self._output / "supervisord.conf"
         with path.open("w") as file:
             configuration(folder, socket, roster).write(file)
-        self._popen = subprocess.Popen(
-            [sys.executable, "-m", "tools.sim.supervised", str(path)],
-            stdout=subprocess.DEVNULL,
-            stderr=(self._output / "supervisord.err").open("w"),
-            stdin=subprocess.DEVNULL,
-            start_new_session=True,  # a Ctrl-C is for the tool, which then stops the tree in order
-        )
+        with (self._output / "supervisord.err").open("w") as errors:
+            self._popen = subprocess.Popen(
+                [sys.executable, "-m", "tools.sim.supervised", str(path)],
+                stdout=subprocess.DEVNULL,
+                stderr=errors,
+                stdin=subprocess.DEVNULL,
+                pass_fds=[lock],
+                start_new_session=True,  # a Ctrl-C is for the tool, which then stops the tree in order
+            )
         self._socket = socket
 
     @property
