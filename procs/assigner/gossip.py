@@ -340,10 +340,11 @@ class Agent:
         """Rows that some neighbour lacks, as many as fit, from where the last packet ended; its own where
         nobody was heard.
         """
-        lacking = [
-            k for k in sorted(self.rows) if any(k not in packet.rows_held for packet in self._heard.values())
-        ]
-        wanted = lacking if self._heard else sorted(self.rows)
+        heard = self._heard.values()
+        lacking = {k for k in self.rows if any(k not in packet.rows_held for packet in heard)}
+        # A neighbour that has not chosen hears its own row back: after a restart it may have said another.
+        echoed = {p.sender for p in heard if p.sender in self.rows and p.sender not in p.choices}
+        wanted = sorted(lacking | echoed if self._heard else self.rows)
         start = next((i for i, k in enumerate(wanted) if k >= self._next_row), 0)
         window: dict[int, Row] = {}
         room = self._room

@@ -245,6 +245,27 @@ def test_a_restarted_drone_takes_up_its_old_choice() -> None:
     assert all(agent.certified for agent in agents)
 
 
+def test_a_drone_that_restarts_before_it_chose_takes_up_its_old_row() -> None:
+    other = Agent(1, 2, [1.0, 2.0], [0, 1])
+    other.step(
+        Agent(0, 2, [3.0, 9.0], [0, 1]).step([], 0.0), 0.0
+    )  # decides on the old row: leaves 0 to the first
+    again = Agent(0, 2, [9.0, 3.0], [0, 1])
+    agents = [again, other]
+    talk(agents, ring_of(2), np.random.default_rng(0))
+    assert [agent.animal for agent in agents] == [0, 1]
+
+
+def test_two_accounts_of_one_choice_end_the_episode_without_a_certificate() -> None:
+    agent = Agent(0, 3, [1.0, 2.0, 3.0], [0, 1, 2])
+    held = frozenset(range(3))
+    rows = {k: Row((0, 1, 2), (100, 200, 300)) for k in (1, 2)}
+    for sender, told in ((1, {1: 1}), (2, {1: 2, 2: 1})):
+        agent.step([encode(Packet(sender, 3, held, told, frozenset(), frozenset(), rows))], 0.0)
+    assert agent.clash
+    assert not agent.certified
+
+
 def test_who_has_told_everybody_speaks_once_a_second() -> None:
     agents = fleet_of(np.eye(3), [0, 1, 2])
     random = np.random.default_rng(0)

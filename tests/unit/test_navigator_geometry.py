@@ -194,6 +194,16 @@ def test_no_velocity_leaves_the_limits(wanted: tuple, previous: tuple, own: tupl
 
 
 @quick
+@given(vectors, st.floats(0, 2 * np.pi), st.floats(98, 140))
+def test_no_velocity_leads_out_of_the_fence(wanted: tuple, bearing: float, reach_m: float) -> None:
+    limits = LimitSettings(fence_radius_m=100.0)
+    outward = np.array([np.cos(bearing), np.sin(bearing), 0.0])
+    place = reach_m * outward + [0, 0, -30]
+    velocity = limited(np.array(wanted), np.array(wanted), place, 0.1, limits)
+    assert velocity @ outward <= 1e-5
+
+
+@quick
 @given(metres, metres, st.floats(-200, 50))
 def test_goals_are_moved_inside_the_fence(n_m: float, e_m: float, d_m: float) -> None:
     limits = LimitSettings(fence_radius_m=100.0)
@@ -229,7 +239,7 @@ def test_a_pixel_comes_back_to_its_place_on_the_ground(
 def test_pixels_over_the_horizon_show_no_ground() -> None:
     level = Pose(0.0, 0.0, -30.0)
     assert len(ground_points(CAMERA, level, np.array([[320.0, 240.0], [0.0, 0.0]]))) == 2
-    tipped = Pose(0.0, 0.0, -30.0, pitch_rad=float(np.radians(75)))
+    tipped = Pose(0.0, 0.0, -30.0, pitch_rad=float(np.radians(85)))
     assert len(ground_points(CAMERA, tipped, np.array([[320.0, 0.0]]))) == 0
     assert len(ground_points(CAMERA, Pose(0.0, 0.0, 1.0), np.array([[320.0, 240.0]]))) == 0
 
