@@ -17,7 +17,9 @@ __all__ = ["Correction", "MapBook", "MapEntry", "UpkeepError"]
 Array = NDArray[np.float64]
 
 HEADER = struct.Struct(">BB")  # format, number of rows
-ROW = struct.Struct(">BhhB")  # animal, n and e in decimetres, age in 0.2 s with the top bit for "I saw it myself"
+ROW = struct.Struct(
+    ">BhhB"
+)  # animal, n and e in decimetres, age in 0.2 s with the top bit for "I saw it myself"
 FORMAT = 0x55
 AGE_UNIT_US = 200_000
 OLDEST = 127
@@ -41,7 +43,12 @@ class Correction:
     def pose(self, own: Pose) -> Pose:
         """The drone's pose in the map's frame."""
         return Pose(
-            own.n_m + self.n_m, own.e_m + self.e_m, own.d_m, own.roll_rad, own.pitch_rad, own.yaw_rad + self.yaw_rad
+            own.n_m + self.n_m,
+            own.e_m + self.e_m,
+            own.d_m,
+            own.roll_rad,
+            own.pitch_rad,
+            own.yaw_rad + self.yaw_rad,
         )
 
     def to_own(self, point: Array, own: Pose) -> Array:
@@ -93,7 +100,8 @@ class MapBook:
         """What to say to the neighbours now."""
         rows = []
         for entry in list(self.entries.values())[:MAX_ANIMALS]:
-            age = round(max(fleet_utime - entry.seen_fleet_utime, 0) / AGE_UNIT_US)
+            # Rounded up: rounded to the nearest, an animal that nobody sees would grow younger as it goes round.
+            age = -(-max(fleet_utime - entry.seen_fleet_utime, 0) // AGE_UNIT_US)
             if age < OLDEST:
                 age |= SAW_IT if entry.mine else 0
                 n_dm, e_dm = (int(np.clip(round(float(x) * 10), -32767, 32767)) for x in entry.position_m)
@@ -102,7 +110,11 @@ class MapBook:
 
     def merge(self, packet: bytes, fleet_utime: int) -> None:
         """Take a neighbour's newer sights. Raises UpkeepError for a packet of another form."""
-        if len(packet) < HEADER.size or packet[0] != FORMAT or len(packet) != HEADER.size + packet[1] * ROW.size:
+        if (
+            len(packet) < HEADER.size
+            or packet[0] != FORMAT
+            or len(packet) != HEADER.size + packet[1] * ROW.size
+        ):
             raise UpkeepError(f"a packet of {len(packet)} bytes is no upkeep packet")
         for row in range(packet[1]):
             animal, n_dm, e_dm, age = ROW.unpack_from(packet, HEADER.size + row * ROW.size)
@@ -111,7 +123,7 @@ class MapBook:
                 continue
             seen = fleet_utime - (age & ~SAW_IT) * AGE_UNIT_US
             position = np.array([n_dm, e_dm]) / 10
-            if age & SAW_IT:
+            if age & SAW_IT and (entry.theirs_m is None or seen >= entry.theirs_fleet_utime):
                 entry.theirs_m, entry.theirs_fleet_utime = position, seen
             # Our own sight comes back to us from the neighbours, a little older: only a clearly newer one counts.
             if seen > entry.seen_fleet_utime + AGE_UNIT_US:
