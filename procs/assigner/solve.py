@@ -30,11 +30,11 @@ def assign(
 ) -> Assignment:
     """Give each agent a goal of its own: costs (n_agents, n_goals) >= 0, inf forbids; agents in ring order.
 
-    "exact": every agent's row of 16-bit costs floods the ring in floor(n/2) rounds (DESIGN section 7); with
-    `loss`, the share of messages that never arrive, whole tables travel for floor(n/2) + max(3, n/4) rounds, and
-    an agent whose table stays incomplete holds (-1). It takes the rounds that it needs; `rounds` bounds methods
-    that may stop early, and must be at least 1. More agents than goals: the rest get -1. Messages are lost by a
-    generator seeded with `seed`.
+    "exact": every agent's row of 16-bit costs floods the ring in floor(n/2) rounds (DESIGN section 7). With
+    `loss`, the share of messages that never arrive, whole tables travel for floor(n/2) + max(3, n/4) rounds,
+    and an agent whose table stays incomplete holds (-1). It takes the rounds that it needs; `rounds` bounds
+    methods that may stop early, and must be at least 1. More agents than goals: the rest get -1. Messages are
+    lost by a generator seeded with `seed`.
 
     Raises ValueError for an unknown method, costs that are not a table of
     numbers >= 0, loss outside 0 to 1, rounds below 1.
