@@ -15,7 +15,7 @@ class Message(Protocol):
 M = TypeVar("M")
 
 
-def make(kind: type[M], **members: Any) -> M:
+def make(kind: type[M], /, **members: Any) -> M:
     """A message of `kind` with its members set by name; AttributeError names a member that it lacks."""
     message = kind()
     for name, value in members.items():
