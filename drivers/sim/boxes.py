@@ -90,11 +90,17 @@ class BoxTracker:
     def reset(self) -> None:
         """Forget the animal."""
         self._animal = -1
-        self._last = BoxTrack(np.zeros((1, 1), np.bool_), np.zeros(2), np.zeros(4), "lost", 0.0, np.zeros((0, 2), np.int64))
+        self._last = BoxTrack(
+            np.zeros((1, 1), np.bool_), np.zeros(2), np.zeros(4), "lost", 0.0, np.zeros((0, 2), np.int64)
+        )
         self._unseen_s = 0.0
 
     def start(
-        self, image: NDArray[np.uint8], point: Sequence[float], box: Any = None, companions: Sequence[Any] = ()
+        self,
+        image: NDArray[np.uint8],
+        point: Sequence[float],
+        box: Any = None,
+        companions: Sequence[Any] = (),
     ) -> BoxTrack:
         """Take up the animal at `point` (u, v) px."""
         ids, boxes = read_boxes(image)

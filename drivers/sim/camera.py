@@ -87,7 +87,12 @@ class BoxPainter:
     MARK = b"BOX0"
 
     def render(
-        self, camera: Pinhole, pose: Pose, t_s: float, animals: Sequence[AnimalView] = (), out: Image | None = None
+        self,
+        camera: Pinhole,
+        pose: Pose,
+        t_s: float,
+        animals: Sequence[AnimalView] = (),
+        out: Image | None = None,
     ) -> Image:
         """(H, W, 3) uint8, black but for the table of boxes."""
         width, height = camera.image_size

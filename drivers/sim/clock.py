@@ -12,9 +12,13 @@ from pathlib import Path
 __all__ = ["ClockPage", "SimClock"]
 
 PAGE_BYTES = 64
-MAPPING = struct.Struct("<qdqd")  # version (odd while written), simulation us at ..., ... this real time in ns, rate
+MAPPING = struct.Struct(
+    "<qdqd"
+)  # version (odd while written), simulation us at ..., ... this real time in ns, rate
 LATE_OFFSET = 48
-LATE = struct.Struct("<d")  # the worst lateness in seconds that any process has told since the world last looked
+LATE = struct.Struct(
+    "<d"
+)  # the worst lateness in seconds that any process has told since the world last looked
 
 
 class ClockPage:

@@ -19,7 +19,7 @@ DIVE_RATE_M_S = 2.0
 TAIL_BEAT_HZ = 0.35
 TURN_RATE_RAD_S = 0.15
 PLACE_GAIN_PER_S = 0.05  # how strongly an animal swims back to its place in the pod
-KEEP_APART_LENGTHS = 0.75
+KEEP_APART_LENGTHS = 0.9
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,9 @@ class Pod:
         wander = self._random.normal(0, 0.25, len(self.heading_rad)) * np.sqrt(dt_s)
         wanted = np.arctan2(wish[:, 1], wish[:, 0])
         turn = np.angle(np.exp(1j * (wanted - self.heading_rad)))
-        self.heading_rad = self.heading_rad + np.clip(turn * dt_s * 0.3, -TURN_RATE_RAD_S * dt_s, TURN_RATE_RAD_S * dt_s)
+        self.heading_rad = self.heading_rad + np.clip(
+            turn * dt_s * 0.3, -TURN_RATE_RAD_S * dt_s, TURN_RATE_RAD_S * dt_s
+        )
         self.heading_rad = np.angle(np.exp(1j * (self.heading_rad + wander * 0.3)))
         ahead = np.column_stack([np.cos(self.heading_rad), np.sin(self.heading_rad)])
         self.position_m = self.position_m + (ahead * self.speed_m_s[:, None] + self._push_apart()) * dt_s

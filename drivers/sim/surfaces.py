@@ -27,4 +27,6 @@ def open_scene(
         return BoxPainter()
     if scene:
         return open_surface(Path(scene), width_m, centre_ne)
-    return SeaRenderer(seed, kind="grass" if kind == "grass" else "sea", species=(species,), sea_state=sea_state)
+    return SeaRenderer(
+        seed, kind="grass" if kind == "grass" else "sea", species=(species,), sea_state=sea_state
+    )

@@ -51,7 +51,10 @@ class World:
         self.autopilots: dict[int, SimAutopilot] = {}
         self.dead: dict[int, float] = {}
         towards_rad = float(np.random.default_rng([settings.seed, 2]).uniform(-np.pi, np.pi))
-        mean = (settings.wind_m_s * float(np.cos(towards_rad)), settings.wind_m_s * float(np.sin(towards_rad)))
+        mean = (
+            settings.wind_m_s * float(np.cos(towards_rad)),
+            settings.wind_m_s * float(np.sin(towards_rad)),
+        )
         for drone_id, home in settings.homes.items():
             random = np.random.default_rng([settings.seed, 3, drone_id])
             self.vehicles[drone_id] = Vehicle(

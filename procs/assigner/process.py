@@ -22,7 +22,6 @@ from procs.runtime import Runtime
 
 STEP_S = 0.2
 SAY_EVERY_STEPS = 2
-KEEP_SAYING_US = 20_000_000  # after this long every living member has the table or is lost
 PREVIOUS_WITHIN_MS = 30_000  # an animal unseen for longer is not held any more
 
 
@@ -37,9 +36,9 @@ class AssignerShell:
         self._agent: Agent | None = None
         self._key = (0, 0)
         self._members: tuple[int, ...] = ()
-        self._began_utime = 0
         self._inbox: list[tuple[tuple[int, int], bytes]] = []
         self._animal = -1
+        self._watched: dict[int, int] = {}  # living drone -> the animal that it says it watches
         self._left: list[int] = []
         self._n_steps = 0
 
@@ -50,6 +49,10 @@ class AssignerShell:
     def on_fleet(self, state: fleet_state_t) -> None:
         """Lost members are waited for no more; an order to leave an animal is kept."""
         self._living = from_bitmap(state.members, self._roster)
+        self._watched = {row.id: row.animal for row in state.rows if row.alive and row.animal >= 0}
+        if self._agent is None and self._animal < 0:
+            # Started anew in flight: the fleet still knows what this drone watches.
+            self._animal = self._watched.get(self._runtime.drone_id, -1)
         if state.order.command == operator_t.LEAVE and state.order.animal not in self._left:
             self._left.append(state.order.animal)
         if self._agent is not None:
@@ -76,11 +79,11 @@ class AssignerShell:
             costs,
             [one.id for one in animals],
             previous=self._animal if self._animal in held else -1,
+            forbidden=[animal for drone, animal in sorted(self._watched.items()) if drone not in members],
         )
         for index, member in enumerate(members):
             if member not in self._living and member != self._runtime.drone_id:
                 self._agent.drop_member(index)
-        self._began_utime = self._runtime.utime
         self._say()
 
     def on_neighbour(self, message: ring_assign_t) -> None:
@@ -92,7 +95,7 @@ class AssignerShell:
         """Go on with the exchange."""
         self._n_steps += 1
         agent = self._agent
-        if agent is not None and self._runtime.utime - self._began_utime <= KEEP_SAYING_US:
+        if agent is not None:
             heard = [packet for key, packet in self._inbox if key == self._key]
             self._inbox = [(key, packet) for key, packet in self._inbox if key > self._key]
             for packet in agent.step(heard, self._runtime.utime / 1e6):

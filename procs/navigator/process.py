@@ -31,6 +31,9 @@ def setup(runtime: Runtime) -> None:
         if name == "vehicle":
             navigator.hear_vehicle(message)
 
+    def listen(name: str, channel: str) -> None:
+        runtime.on(channel, lambda message: remember(name, message))
+
     def update() -> None:
         outputs = navigator.update(Inputs(utime=runtime.utime, **newest))
         runtime.publish(channels.SETPOINT, outputs.setpoint)
@@ -38,5 +41,5 @@ def setup(runtime: Runtime) -> None:
             runtime.publish(channels.MISSION_STATE, outputs.mission)
 
     for name, channel in NEWEST_OF.items():
-        runtime.on(channel, lambda message, name=name: remember(name, message))
+        listen(name, channel)
     runtime.every(PERIOD_S, update)

@@ -31,6 +31,14 @@ class Followed:
     utime: int
     velocity_m_s: Array = field(default_factory=lambda: np.zeros(2))
     animal: int = -1
+    candidate: int = -1  # an id that the map offers, and for how many sights running
+    n_offers: int = 0
+
+    def offered(self, animal_id: int) -> int:
+        """The map offers an id (-1: none) -> for how many sights running it has been the same."""
+        self.n_offers = self.n_offers + 1 if animal_id == self.candidate else 1
+        self.candidate = animal_id
+        return self.n_offers
 
     def predict(self, utime: int) -> Array:
         """(2,) where it should be at `utime`."""

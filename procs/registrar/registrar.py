@@ -26,10 +26,12 @@ DETECTED_AFTER_US = 450_000  # by then the detector has said what it found at t
 SECOND_LOOK_US = 1_200_000  # a pair's second instant, at least 1 s after the first
 SAID_AFTER_END_US = 1_500_000  # a finished drone repeats its packets, so that the others end too
 SEEN_NOW_US = 1_000_000
-TAKE_UP_LENGTHS = (
-    0.5  # an unnamed box this near to a mapped animal that nobody else here holds is that animal
-)
+# An unnamed box this near to a mapped animal that no box here is, and far from its rivals, for so many
+# sights running is that animal.
+TAKE_UP_LENGTHS = 0.4
+TAKE_UP_SIGHTS = 4
 CORRECTION_GAIN = 0.05
+FAR_AHEAD_US = 10_000_000  # an instant further ahead was told by a clock that is not the fleet's
 UPKEEP = -1  # ring_map_t.instant of a packet of the map's upkeep
 
 
@@ -59,6 +61,7 @@ class Running:
 
     proposal: Proposal
     looks: list[Look]
+    lost: list[int] = field(default_factory=list)
     ended_utime: int | None = None
 
 
@@ -111,7 +114,7 @@ class Registrar:
         ground = apply_homography(self._camera.image_to_ground(pose), centres)
         sighting = self.carrier.update(utime, boxes, ground)
         if self.finished is not None and self.running is None:
-            self._take_up(sighting, pose, fleet_utime)
+            self._take_up(sighting, pose)
         return sighting, self._note_sights(sighting, pose, fleet_utime)
 
     def propose(self, members: tuple[int, ...], utime: int, fleet_utime: int) -> None:
@@ -151,6 +154,7 @@ class Registrar:
     def drop_member(self, drone_id: int) -> None:
         """A member is lost: its turn is skipped."""
         if self.running is not None and drone_id in self.running.proposal.members:
+            self.running.lost.append(drone_id)
             for look in self.running.looks:
                 if look.node is not None:
                     look.node.drop_member(drone_id)
@@ -160,14 +164,17 @@ class Registrar:
         return [(entry, self.correction.to_own(entry.position_m, own)) for entry in self.map.entries.values()]
 
     def _adopt(self, utime: int, fleet_utime: int) -> None:
-        """Begin the newest proposal where it is not begun or over."""
+        """Begin the newest proposal where it is not begun or over; it ends an older one."""
         proposal = self.book.newest
         if proposal is None or proposal.key <= self._handled:
             return
         if self.running is not None and self.running.proposal.key >= proposal.key:
             return
-        if fleet_utime > proposal.t_utime + self._limit_us or self._drone_id not in proposal.members:
+        is_over = fleet_utime > proposal.t_utime + self._limit_us
+        is_senseless = proposal.t_utime > fleet_utime + FAR_AHEAD_US
+        if is_over or is_senseless or self._drone_id not in proposal.members:
             self._handled = proposal.key
+            self.running = None
             return
         looks = [Look(proposal.t_utime)]
         if len(proposal.members) == 2:
@@ -210,6 +217,8 @@ class Registrar:
             memory=memory,
             **options,
         )
+        for lost in running.lost:
+            look.node.drop_member(lost)
 
     def _end(
         self, running: Running, fleet_utime: int, pose_at: Callable[[int], Pose | None], utime: int
@@ -285,21 +294,27 @@ class Registrar:
             ]
         )
 
-    def _take_up(self, sighting: Sighting, pose: Pose, fleet_utime: int) -> None:
+    def _take_up(self, sighting: Sighting, pose: Pose) -> None:
         """Name boxes that have no name by the map, where one animal alone is near enough (DESIGN section 4, MONITOR)."""
         held = set(self.carrier.held_ids(sighting.utime, SEEN_NOW_US))
         free = [entry for entry in self.map.entries.values() if entry.animal not in held]
-        for animal, position in zip(sighting.followed, sighting.ground_m, strict=True):
-            if animal.animal >= 0 or not free:
-                continue
-            here = self.correction.to_map(position, pose)
-            distance = sorted(
-                (float(np.linalg.norm(entry.position_m - here)), entry.animal) for entry in free
-            )
-            clear = len(distance) == 1 or distance[1][0] > distance[0][0] + TAKE_UP_LENGTHS * self._length_m
-            if distance[0][0] <= TAKE_UP_LENGTHS * self._length_m and clear:
-                self.carrier.name_one(animal, distance[0][1])
-                free = [entry for entry in free if entry.animal != distance[0][1]]
+        unnamed = [
+            (animal, self.correction.to_map(position, pose))
+            for animal, position in zip(sighting.followed, sighting.ground_m, strict=True)
+            if animal.animal < 0
+        ]
+        if not free or not unnamed:
+            return
+        places = np.array([entry.position_m for entry in free])
+        distance = np.array([np.linalg.norm(places - here, axis=1) for _, here in unnamed])
+        reach = TAKE_UP_LENGTHS * self._length_m
+        for row, (animal, _) in enumerate(unnamed):
+            column = int(np.argmin(distance[row]))
+            rivals = np.append(np.delete(distance[row], column), np.delete(distance[:, column], row))
+            clear = distance[row, column] <= reach and bool(np.all(rivals > 2 * reach))
+            offer = free[column].animal if clear else -1
+            if animal.offered(offer) >= TAKE_UP_SIGHTS and offer >= 0:
+                self.carrier.name_one(animal, offer)
 
     def _note_sights(self, sighting: Sighting, pose: Pose, fleet_utime: int) -> dict[int, float]:
         """Write our own sights into the map; lean our correction towards what the neighbours see."""

@@ -25,14 +25,22 @@ NO_ROUTE = "no multicast route; for real buses: ip route add 224.0.0.0/4 dev lo"
 
 
 def sim(
-    mission: Annotated[str, typer.Argument(help="A mission file, or the name of one that ships.")] = "default",
+    mission: Annotated[
+        str, typer.Argument(help="A mission file, or the name of one that ships.")
+    ] = "default",
     drones: Annotated[int | None, typer.Option(min=1, max=20, help="How many drones.")] = None,
     animals: Annotated[int | None, typer.Option(min=0, max=20, help="How many animals.")] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="The same seed gives the same run.")] = None,
-    duration: Annotated[float | None, typer.Option(min=1, help="End after this many simulated seconds.")] = None,
+    duration: Annotated[
+        float | None, typer.Option(min=1, help="End after this many simulated seconds.")
+    ] = None,
     scene: Annotated[Path | None, typer.Option(help="A photograph or video as the world's surface.")] = None,
-    autopilot: Annotated[str, typer.Option(help="'sim', or a comma between addresses of real ones.")] = SIMULATED,
-    sensor: Annotated[str, typer.Option(help="pixels, or boxes in place of pixels for large batches.")] = "pixels",
+    autopilot: Annotated[
+        str, typer.Option(help="'sim', or a comma between addresses of real ones.")
+    ] = SIMULATED,
+    sensor: Annotated[
+        str, typer.Option(help="pixels, or boxes in place of pixels for large batches.")
+    ] = "pixels",
     out: Annotated[Path, typer.Option(help="Where the run's folder is made.")] = Path("runs"),
     headless: Annotated[bool, typer.Option("--headless", help="No live display.")] = False,
     lockstep: Annotated[bool, typer.Option("--lockstep", help="One process on a virtual clock.")] = False,
@@ -110,7 +118,9 @@ def _plan(
                 f"--autopilot names {len(addresses)} addresses for {len(mission.drones)} drones; give one each"
             )
         if lockstep:
-            raise MissionError("--lockstep runs on a virtual clock, which a real autopilot cannot follow; drop one")
+            raise MissionError(
+                "--lockstep runs on a virtual clock, which a real autopilot cannot follow; drop one"
+            )
     if scene is not None:
         if not scene.exists():
             raise MissionError(f"--scene {scene}: no such file; give a photograph or a video")
@@ -129,5 +139,7 @@ def _fly(plan: RunPlan, console: Console, *, headless: bool, lockstep: bool, fal
         fly(None)
         return
     mission = plan.mission
-    with LiveView(mission.roster, title=mission.name, watch_s=mission.watch.watch_s, console=console) as screen:
+    with LiveView(
+        mission.roster, title=mission.name, watch_s=mission.watch.watch_s, console=console
+    ) as screen:
         fly(screen)

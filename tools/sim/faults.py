@@ -9,7 +9,12 @@ from tools.sim.settings import Fault
 
 __all__ = ["FaultPlan", "Victim"]
 
-STAGES = {"scout": State.SCOUT, "monitor": State.MONITOR}
+STAGES = {
+    "scout": State.SCOUT,
+    "found": State.FOUND,
+    "register": State.REGISTER,
+    "monitor": State.MONITOR,
+}
 
 
 class Victim(Protocol):
@@ -67,7 +72,7 @@ class FaultPlan:
         if stage == "start":
             return True
         wanted = STAGES[stage]
-        if stage == "scout":
+        if stage != "monitor":
             return wanted in self.states.values()
         flying = [state for state in self.states.values() if state != State.STANDBY]
         return bool(flying) and all(state == wanted for state in flying)
@@ -93,4 +98,6 @@ class FaultPlan:
         return []
 
     def _scout(self) -> int:
-        return min((drone for drone, state in self.states.items() if state == State.SCOUT), default=min(self.states))
+        return min(
+            (drone for drone, state in self.states.items() if state == State.SCOUT), default=min(self.states)
+        )

@@ -203,7 +203,9 @@ class ProcessFleet:
             bus_url=bus_url(drone_id, self._slot.number),
             run_dir=str(self.plan.folder),
             log_path=str(self.plan.log_path(drone_id)),
-            drivers={name: DriverSpec(driver=driver, options=options) for name, (driver, options) in specs.items()},
+            drivers={
+                name: DriverSpec(driver=driver, options=options) for name, (driver, options) in specs.items()
+            },
         )
 
 

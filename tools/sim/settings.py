@@ -60,7 +60,7 @@ class Fault(Section):
     """One fault: `when` the fleet reaches a stage (or at once), `after_s` seconds later."""
 
     kind: Literal["dive", "kill", "cut"]
-    when: Literal["start", "scout", "monitor"] = "monitor"
+    when: Literal["start", "scout", "found", "register", "monitor"] = "monitor"
     after_s: float = Field(10.0, ge=0, le=3600)
     for_s: float = Field(20.0, gt=0, le=3600)
     drone: int = Field(0, ge=0, le=99)  # kill: which; 0 for the one that scouts
@@ -97,5 +97,7 @@ class SimMission(Mission):
             if fault.kind == "kill" and fault.drone and fault.drone not in self.roster:
                 raise ValueError(f"faults: drone {fault.drone} is not in the roster {list(self.roster)}")
             if fault.kind == "cut" and not set(fault.between) <= set(self.roster):
-                raise ValueError(f"faults: the link {fault.between} is not between members of {list(self.roster)}")
+                raise ValueError(
+                    f"faults: the link {fault.between} is not between members of {list(self.roster)}"
+                )
         return self

@@ -7,4 +7,7 @@ from procs.main import end_with_parent
 
 if __name__ == "__main__":
     end_with_parent()
-    os.execv(sys.executable, [sys.executable, "-W", "ignore", "-m", "supervisor.supervisord", "-n", "-c", sys.argv[1]])
+    os.execv(
+        sys.executable,
+        [sys.executable, "-W", "ignore", "-m", "supervisor.supervisord", "-n", "-c", sys.argv[1]],
+    )

@@ -46,7 +46,9 @@ class TruthWriter:
         self._file.close()
 
 
-def labelled_animals(scene: Path, width_m: float, centre_ne: tuple[float, float]) -> list[world_animal_t] | None:
+def labelled_animals(
+    scene: Path, width_m: float, centre_ne: tuple[float, float]
+) -> list[world_animal_t] | None:
     """The animals of a picture's YOLO labels (same name, .txt, beside it or in ../labels); None without such a file."""
     places = (scene.with_suffix(".txt"), scene.parent.parent / "labels" / f"{scene.stem}.txt")
     labels = next((place for place in places if place.exists()), None)
