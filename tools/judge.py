@@ -28,7 +28,7 @@ from tools.sights import (
     watch_spans,
 )
 
-__all__ = ["DroneVerdict", "Verdict", "judge", "load_run"]
+__all__ = ["DroneVerdict", "Verdict", "drone_list", "judge", "load_run"]
 
 Ids = NDArray[np.int64]
 
@@ -179,7 +179,7 @@ def _why_no_window(truth: Truth, drones: Sequence[DroneLog], assigned: Sequence[
         return "no drone ever came to MONITOR: " + ", ".join(ends)
     late = [drone.id for drone in assigned if not monitor_spans(drone)]
     if late:
-        return f"{_drones(late)} had an animal to watch but never came to MONITOR"
+        return f"{drone_list(late)} had an animal to watch but never came to MONITOR"
     return "the drones were never all in MONITOR at the same time"
 
 
@@ -209,7 +209,9 @@ def _judge_distinct(
         if len(together) > 1:
             shared = np.logical_and.reduce([watch[drone_id] == animal for drone_id in together])
             since_s = _since(shared, grid_s)
-            reasons.append(f"{_drones(together)} {_all(together)} watch animal {animal} from {since_s:.1f} s")
+            reasons.append(
+                f"{drone_list(together)} {_all(together)} watch animal {animal} from {since_s:.1f} s"
+            )
     share = _distinct_share(truth, watch, [v.animal for v in living if v.animal is not None], grid_s)
     if share < DISTINCT_SHARE:
         worst = min(
@@ -306,11 +308,15 @@ def _disputed_names(verdicts: Sequence[DroneVerdict]) -> list[str]:
     reasons = []
     for identity, animals in sorted(by_identity.items()):
         if len(animals) > 1:
-            who = ", ".join(f"animal {animal} for {_drones(ids)}" for animal, ids in sorted(animals.items()))
+            who = ", ".join(
+                f"animal {animal} for {drone_list(ids)}" for animal, ids in sorted(animals.items())
+            )
             reasons.append(f"identity {identity} is not one animal: {who}")
     for animal, identities in sorted(by_animal.items()):
         if len(identities) > 1:
-            who = ", ".join(f"{identity} by {_drones(ids)}" for identity, ids in sorted(identities.items()))
+            who = ", ".join(
+                f"{identity} by {drone_list(ids)}" for identity, ids in sorted(identities.items())
+            )
             reasons.append(f"animal {animal} has {len(identities)} identities: {who}")
     return reasons
 
@@ -324,8 +330,8 @@ def _praise(truth: Truth, verdicts: Sequence[DroneVerdict], window: Interval) ->
     return f"identities agreed and held from {window[0]:.1f} to {window[1]:.1f} s: " + ", ".join(pairs)
 
 
-def _drones(ids: Sequence[int]) -> str:
-    """drone 1; drones 1 and 3; drones 1, 2 and 3."""
+def drone_list(ids: Sequence[int]) -> str:
+    """In words: drone 1; drones 1 and 3; drones 1, 2 and 3."""
     words = [str(i) for i in ids]
     if len(words) == 1:
         return f"drone {words[0]}"

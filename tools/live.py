@@ -162,7 +162,8 @@ class LiveView:
         row.beats[beat.process] = now_s, beat
         if before is not None and before[1].pid != beat.pid:
             self.note(now_s, f"drone {drone_id}: {beat.process} was started again, process {beat.pid}")
-        if beat.status != heartbeat_t.OK and (before is None or before[1].detail != beat.detail):
+        was_well = before is None or before[1].status == heartbeat_t.OK
+        if beat.status != heartbeat_t.OK and was_well:
             self.note(now_s, f"drone {drone_id}: {beat.process}: {beat.detail}")
 
     def _stage(self) -> str | None:

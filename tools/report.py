@@ -13,7 +13,7 @@ from typing import Any
 from jinja2 import Environment, StrictUndefined
 
 from tools.evidence import Run, load_run
-from tools.judge import judge
+from tools.judge import drone_list, judge
 from tools.report_figures import animal_colour, draw_map, draw_timeline, drone_colour, pick_shots
 from tools.summary import headline, summary_of
 
@@ -81,30 +81,30 @@ def _render(run: Run) -> str:
 def _findings(summary: dict[str, Any], is_good: bool | None) -> list[str]:
     """What people should know beside the headline, the worst first."""
     findings = list(summary["reasons"]) if is_good is False else []
+    aloft: dict[str, list[int]] = {}
     for drone in summary["drones"]:
         if drone["died_s"] is not None:
             findings.append(f"drone {drone['id']} died {drone['died_s']:.0f} s after the start")
         elif drone["final_state"] is None:
             findings.append(f"drone {drone['id']} left no log")
         elif drone["final_state"] != "LANDED":
-            findings.append(
-                f"drone {drone['id']} was not back on the ground when the run ended: it {_ended(drone)}"
-            )
+            aloft.setdefault(drone["final_state"], []).append(drone["id"])
         if drone["in_image_share"] is not None and drone["in_image_share"] < LOW_SHARE:
             share = drone["in_image_share"]
             findings.append(
                 f"drone {drone['id']} had its animal in the picture for only {share:.0%} of its watch"
             )
+    findings += [
+        f"the run ended before {drone_list(ids)} {'was' if len(ids) == 1 else 'were'} back on the ground; "
+        f"last state {state}: {_state_words(state)}"
+        for state, ids in aloft.items()
+    ]
     findings += [f"not everything could be read: {problem}" for problem in summary["problems"]]
     if summary["fallback_reason"]:
         findings.append(f"flown in {summary['mode']} mode: {summary['fallback_reason']}")
     if summary["sensor"] == "boxes":
         findings.append("no pixels were looked at: detections and tracks were drawn with calibrated errors")
     return findings
-
-
-def _ended(drone: dict[str, Any]) -> str:
-    return _state_words(drone["final_state"])
 
 
 def _state_words(state: str) -> str:
