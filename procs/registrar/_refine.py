@@ -123,6 +123,14 @@ def _compose(parameters: Array) -> Array:
     return result
 
 
+def _best_distinct(columns: Ints, scores: Array, n_kept: int) -> list[int]:
+    """Rows of the best-scored starting points, one for each matching: those that agree end alike."""
+    seen: dict[tuple[int, ...], int] = {}
+    for row in np.argsort(-scores, kind="stable").tolist():
+        seen.setdefault(tuple(columns[row].tolist()), row)
+    return list(seen.values())[:n_kept]
+
+
 def refine(pair: Pair, homographies: Array) -> list[Candidate]:
     """Distinct matchings from starting similarities (K, 3, 3), by falling log evidence."""
     best: dict[tuple[int, ...], Candidate] = {}
@@ -146,5 +154,5 @@ def refine(pair: Pair, homographies: Array) -> list[Candidate]:
                 best[key] = Candidate(
                     columns[index], float(scores[index]), homographies[index], gains[index], level
                 )
-        homographies = homographies[np.argsort(-scores, kind="stable")[:n_kept]]
+        homographies = homographies[_best_distinct(columns, scores, n_kept)]
     return sorted(best.values(), key=lambda one: -one.score)

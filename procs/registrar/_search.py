@@ -14,7 +14,7 @@ COARSE_SIGMA = (
     0.5  # body sizes: a similarity misses the tilt of two cameras by about this at the image's edge
 )
 LOG_SCALE_GATE = 0.45  # |ln| between the scale of a pair's distance and of its sizes
-MAX_SCORED = 1200
+MAX_SCORED = 800
 MAX_KEPT = 48
 
 

@@ -94,7 +94,7 @@ def test_an_altered_byte_is_noticed(place, flip):
         decode_map(bytes(packet))
 
 
-@pytest.mark.parametrize("length", range(0, HEADER_BYTES + 2 * ANIMAL_BYTES))
+@pytest.mark.parametrize("length", range(HEADER_BYTES + 2 * ANIMAL_BYTES))
 def test_a_truncated_packet_is_noticed(length):
     with pytest.raises(PacketError):
         decode_map(encode_map(HEADER, [whale(1), whale(2)])[:length])

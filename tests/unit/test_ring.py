@@ -167,7 +167,7 @@ def test_a_line_ends_as_a_ring_does():
     views = views_of(5, 4, seed=10)
     ring, line = nodes_of(views), nodes_of(views)
     fly(ring, ring_links(4))
-    fly(line, ring_links(4)[1:3] + [(0, 1)])
+    fly(line, [*ring_links(4)[1:3], (0, 1)])
     assert [n.result.identities.tolist() for n in line] == [n.result.identities.tolist() for n in ring]
     assert all(node.result.consensus for node in line)
 
@@ -261,7 +261,7 @@ def test_the_map_tells_each_drone_where_it_is():
     turn = geometry[0].yaw_rad - first.yaw_rad
     scale = geometry[0].height_m / first.height_m
     for node, view in zip(nodes, views, strict=True):
-        # The map is the world as the first drone believes it: turned by its compass error about its own position.
+        # The map is the world as the first drone believes it: turned by its compass error about itself.
         away = np.array([view.pose.n_m - first.n_m, view.pose.e_m - first.e_m]) * scale
         cos, sin = np.cos(turn), np.sin(turn)
         expected = np.array([cos * away[0] - sin * away[1], sin * away[0] + cos * away[1]])
