@@ -27,6 +27,7 @@ GUESSED_SIDES = (0.08, 0.16, 0.3, 0.5)
 # was 0.28 or more and the ellipse at most 1.2 of the box; over 160 of water the medians are 0.09 and 1.6.
 FIRST_SEPARATION = 0.22
 BOX_FILL_MOST = 1.3
+FIRST_FILL = 0.62  # of its ellipse: shreds between neighbours, where the animal itself has dived, fill less
 POD_REACH = 1.8  # of the own length: companions this near are told apart by their pixels
 POD_LENGTH_PX = 40.0  # window px of a body in that wider window
 BOX_EDGE = 1.12  # boxes are loose, seldom tight: this far beyond its edge no pixel is thought the animal's
@@ -112,6 +113,8 @@ def _look_in_box(image: Image, point: Array, box: Array, companions: list[Compan
             break
         sight, body = latest, latest.body
     if sight is None or sight.separation < FIRST_SEPARATION:
+        return None
+    if sight.area_ratio < FIRST_FILL:
         return None
     if in_frame(sight.body, window).area_px > BOX_FILL_MOST * float(np.prod(box[2:] - box[:2])):
         return None
