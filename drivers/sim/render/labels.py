@@ -57,17 +57,19 @@ def _clip_polygon(points: Array, width: float, height: float) -> Array:
     1974).
     """
     for axis, limit, side in ((0, 0.0, 1.0), (0, width, -1.0), (1, 0.0, 1.0), (1, height, -1.0)):
+        inside = side * (points[:, axis] - limit)
+        if np.all(inside >= 0):
+            continue
+        following, inside_next = np.roll(points, -1, axis=0), np.roll(inside, -1)
+        crosses = (inside >= 0) != (inside_next >= 0)
+        share = inside / np.where(crosses, inside - inside_next, 1.0)
+        crossings = points + (following - points) * share[:, None]
+        crossings[:, axis] = limit
+        # Each corner that is inside, then the place where the edge after it crosses the limit.
+        kept = np.stack([inside >= 0, crosses], axis=1)
+        points = np.stack([points, crossings], axis=1)[kept]
         if len(points) == 0:
             break
-        inside = side * (points[:, axis] - limit)
-        following, inside_next = np.roll(points, -1, axis=0), np.roll(inside, -1)
-        kept: list[Array] = []
-        for start, end, a, b in zip(points, following, inside, inside_next, strict=True):
-            if a >= 0:
-                kept.append(start)
-            if (a >= 0) != (b >= 0):
-                kept.append(start + (end - start) * (a / (a - b)))
-        points = np.array(kept).reshape(-1, 2)
     return points
 
 

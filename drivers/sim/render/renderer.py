@@ -73,6 +73,7 @@ class SeaRenderer:
             raise ValueError(f"water {water!r} is not known; there are: {', '.join(WATERS)}")
         self._seed, self._kind = seed, kind
         self._shapes = dict(shapes or {})
+        known = [self._species(name) for name in species]
         self._layers = _cached_layers(seed, kind, sea_state)
         self._table = _sea_table(seed, water) if kind == "sea" else _grass_table()
         self._glint = glint if kind == "sea" else 0.0
@@ -84,10 +85,10 @@ class SeaRenderer:
             ]
         )
         self._roughness = 0.12 + 0.05 * sea_state
-        for name in species:
+        for each in known:
             for individual in range(INDIVIDUALS):
                 for picture in range(PHASES + 1) if kind == "sea" else (PHASES + 1,):
-                    self._sprite(self._species(name), individual, picture)
+                    self._sprite(each, individual, picture)
 
     def render(
         self,
