@@ -1,13 +1,13 @@
-"""Where a simulated run's buses lie: the lowest free slot, so that two runs on one machine never hear each other."""
+"""Where a run's buses lie: the lowest free slot, so that two runs on one machine never hear each other."""
 
 import fcntl
 import os
 import socket
 import tempfile
 from pathlib import Path
-from typing import IO
+from typing import IO, Self
 
-__all__ = ["FIRST_PORT", "Slot", "bus_url", "free_udp_ports", "has_multicast_route"]
+__all__ = ["FIRST_PORT", "N_SLOTS", "Slot", "bus_url", "free_udp_ports", "has_multicast_route"]
 
 FIRST_PORT = 7667
 N_SLOTS = 50
@@ -19,10 +19,16 @@ def bus_url(drone_id: int, slot: int) -> str:
 
 
 class Slot:
-    """The lowest slot that nobody holds; free again when it is closed, here and in whoever inherited its lock."""
+    """The lowest slot that nobody holds; free again when it is closed here and in whoever inherited its lock."""
 
     def __init__(self) -> None:
         self.number, self._file = _lock_lowest()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        self.close()
 
     def fileno(self) -> int:
         """The lock's file descriptor."""

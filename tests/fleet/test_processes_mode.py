@@ -1,0 +1,301 @@
+"""A fleet as real processes, and what becomes of it when they are killed one after another, and all at once.
+
+One flight serves most of these tests: it is flown, disturbed and written down once. There is no fallback
+here: where processes cannot fly, these tests fail.
+"""
+
+import fcntl
+import json
+import os
+import signal
+import subprocess
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import lcm
+import psutil
+import pytest
+
+from lcmtypes import channels
+from logs.reader import info, read, segments
+from procs import processes
+from procs.navigator.states import State
+from procs.relay.keys import make_key
+from tests.fleet.conftest import new_plan
+from tools.judge import Verdict, judge, load_run
+from tools.sim import processes as process_mode
+from tools.sim.buses import N_SLOTS, Slot
+from tools.sim.plan import RunPlan
+from tools.sim.processes import SHARED_FOLDER, ProcessFleet
+from tools.sim.run import fly_lockstep, write_truth_notes
+from tools.sim.settings import SimMission
+from tools.sim.watch import Watch
+
+VICTIM = 2
+# The eyes and the memory are killed on the way: dead within the watch, they would take from the judge what he
+# looks at.
+KILLED_ON_THE_WAY = ("camera", "detector", "tracker", "logger", "registrar", "assigner", "relay")
+KILLED_WHILE_WATCHING = ("navigator", "autopilot")
+RESPAWN_LIMIT_S = 45.0  # of a machine that does five other things; an idle one takes about 2
+GONE_LIMIT_S = 20.0
+FLIGHT_LIMIT_S = 210.0
+RATE_TOLERANCE = 0.25
+
+
+@dataclass
+class Killer:
+    """The run's screen: kills one process of the victim after another, when the one before has come back."""
+
+    pids: dict[str, int] = field(default_factory=dict)  # newest pid of each of the victim's processes
+    respawn_s: dict[str, float] = field(default_factory=dict)
+    states: dict[int, State] = field(default_factory=dict)
+    waiting: str = ""
+    killed_s: float = 0.0
+    killed_pid: int = 0
+
+    def hear(self, drone_id: int, channel: str, message: Any, _now_s: float) -> None:
+        if channel == channels.MISSION_STATE:
+            self.states[drone_id] = State(message.state)
+        elif channel == channels.HEARTBEAT and drone_id == VICTIM:
+            self.pids[message.process] = message.pid
+            if message.process == self.waiting and message.pid != self.killed_pid:
+                self.respawn_s[self.waiting] = time.monotonic() - self.killed_s
+                self.waiting = ""
+
+    def note(self, _now_s: float, text: str) -> None:
+        raise AssertionError(f"the mission names no fault, but: {text}")
+
+    def tick(self, _now_s: float, _realtime_factor: float) -> None:
+        """Kill the next one when it is time."""
+        if self.waiting:
+            waited_s = time.monotonic() - self.killed_s
+            assert waited_s < RESPAWN_LIMIT_S, f"{self.waiting} has not come back for {waited_s:.0f} s"
+            return
+        victim = self.states.get(VICTIM, State.IDLE)
+        is_up = victim not in (State.IDLE, State.TAKEOFF, State.LAND, State.LANDED)
+        due = [*KILLED_ON_THE_WAY] if is_up else []
+        if victim == State.MONITOR:
+            due += KILLED_WHILE_WATCHING
+        left = [name for name in due if name not in self.respawn_s]
+        if left:
+            self.waiting, self.killed_pid, self.killed_s = left[0], self.pids[left[0]], time.monotonic()
+            os.kill(self.killed_pid, signal.SIGKILL)
+
+
+@dataclass(frozen=True)
+class Flight:
+    """What one disturbed flight left behind."""
+
+    plan: RunPlan
+    respawn_s: dict[str, float]
+    left_running: list[str]
+    left_in_memory: list[str]
+    wall_s: float
+    verdict: Verdict
+    screen: Killer
+
+
+def running(folder: Path) -> list[psutil.Process]:
+    """The processes whose command line names the run's folder."""
+    return [
+        process
+        for process in psutil.process_iter(["cmdline"])
+        if any(str(folder) in word for word in process.info["cmdline"] or [])
+    ]
+
+
+@pytest.fixture(scope="module")
+def flight(near: SimMission, tmp_path_factory: pytest.TempPathFactory) -> Flight:
+    plan = new_plan(near, tmp_path_factory.mktemp("flight") / "run")
+    make_key(plan.folder / near.radio.key_file)
+    killer = Killer()
+    watch = Watch(near, killer)
+    with ProcessFleet(plan, watch) as fleet:
+        fleet.wait_until_ready()
+        began, over = time.monotonic(), False
+        while not over:
+            assert time.monotonic() - began < FLIGHT_LIMIT_S, f"states {killer.states} at {fleet.now_s:.0f} s"
+            fleet.look()
+            over = watch.step(fleet.now_s, fleet, 1.0)
+        wall_s = time.monotonic() - began
+        write_truth_notes(plan, watch, "processes", "", fleet.now_s, wall_s)
+        tree = running(plan.folder)
+        assert len(tree) == 2 + 9 * len(near.roster), "supervisord, the world and nine processes a drone"
+        os.kill(fleet.supervisor.pid, signal.SIGKILL)
+        psutil.wait_procs(tree, timeout=GONE_LIMIT_S)
+        left_running = [" ".join(process.cmdline()) for process in running(plan.folder) if is_alive(process)]
+    memory = [path.name for path in SHARED_FOLDER.glob(f"podwatch_{fleet._run}_*")]
+    truth = load_run(plan.folder)
+    verdict = judge(truth.truth, truth.drones)
+    return Flight(plan, killer.respawn_s, left_running, memory, wall_s, verdict, killer)
+
+
+def is_alive(process: psutil.Process) -> bool:
+    try:
+        return bool(process.status() != psutil.STATUS_ZOMBIE)
+    except psutil.NoSuchProcess:
+        return False
+
+
+@pytest.mark.timeout(400)
+def test_every_process_of_a_drone_comes_back_from_kill_9(flight, record_property):
+    record_property("respawn_s", flight.respawn_s)
+    assert sorted(flight.respawn_s) == sorted(processes.BY_NAME)
+
+
+def test_the_drone_whose_processes_were_killed_ends_on_the_ground_like_the_others(flight):
+    assert flight.screen.states == dict.fromkeys(flight.plan.mission.roster, State.LANDED)
+
+
+def test_each_drone_still_watched_an_animal_of_its_own(flight):
+    assert flight.verdict.distinct, flight.verdict.reasons
+    assert all(drone.is_assigned for drone in flight.verdict.drones)
+
+
+def test_the_run_says_that_processes_flew_and_nothing_fell_back(flight):
+    about = json.loads((flight.plan.folder / "truth.json").read_text())
+    assert (about["mode"], about["fallback_reason"]) == ("processes", None)
+    pids = {
+        message.pid
+        for drone_id in flight.plan.mission.roster
+        for message in said(flight.plan, drone_id, channels.HEARTBEAT)
+    }
+    assert len(pids - {0}) >= 9 * len(flight.plan.mission.roster)
+
+
+def test_supervisord_killed_leaves_nothing_running_and_nothing_in_shared_memory(flight):
+    assert flight.left_running == []
+    assert flight.left_in_memory == []
+
+
+def test_a_killed_logger_costs_a_second_and_its_successor_writes_a_segment_of_its_own(flight):
+    logs = list(segments(flight.plan.log_path(VICTIM)))
+    assert len(logs) == 2
+    assert all(len(list(segments(flight.plan.log_path(other)))) == 1 for other in (1, 3))
+    assert info(logs[1]).closed, "ended by the supervisor's death, yet in order"
+
+
+def said(plan: RunPlan, drone_id: int, channel: str) -> list[Any]:
+    return [message for _, _, message in read(plan.log_path(drone_id), channels=channel)]
+
+
+def rates(plan: RunPlan, drone_id: int) -> dict[str, tuple[str, float]]:
+    """Channel -> (type, messages a second between its first and its last) in one drone's log."""
+    times: dict[str, list[float]] = {}
+    kinds: dict[str, str] = {}
+    for channel, log_time_ns, message in read(plan.log_path(drone_id), strict=True):
+        times.setdefault(channel, []).append(log_time_ns / 1e9)
+        kinds[channel] = type(message).__name__
+    spans = {channel: at_s[-1] - at_s[0] for channel, at_s in times.items()}
+    return {
+        channel: (kinds[channel], (len(at_s) - 1) / spans[channel])
+        for channel, at_s in times.items()
+        if spans[channel] > 0
+    }
+
+
+@pytest.mark.timeout(400)
+def test_both_modes_leave_the_same_channels_at_the_same_rates(flight, near, tmp_path):
+    plan = new_plan(near, tmp_path / "run")
+    fly_lockstep(plan, None)
+    for drone_id in (1, 3):  # those that nobody killed
+        real, virtual = rates(flight.plan, drone_id), rates(plan, drone_id)
+        assert {name: kind for name, (kind, _) in real.items()} == {
+            name: kind for name, (kind, _) in virtual.items()
+        }
+        for channel in channels.CHANNELS:
+            if channel.rate_hz:
+                for _, rate_hz in (real[channel.name], virtual[channel.name]):
+                    assert rate_hz == pytest.approx(channel.rate_hz, rel=RATE_TOLERANCE), channel.name
+
+
+class NoSupervisor:
+    """In place of supervisord where a test needs only what a run lays out around it."""
+
+    def __init__(self, *_options: object) -> None: ...
+
+    def stop(self) -> None: ...
+
+    def check(self) -> None: ...
+
+
+@pytest.fixture
+def laid_out(near: SimMission, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """Makes fleets without processes; all are closed at the end."""
+    monkeypatch.setattr(process_mode, "Supervisor", NoSupervisor)
+    fleets: list[ProcessFleet] = []
+
+    def lay_out(name: str) -> ProcessFleet:
+        fleets.append(ProcessFleet(new_plan(near, tmp_path / name), Watch(near, None)))
+        return fleets[-1]
+
+    yield lay_out
+    for fleet in fleets:
+        fleet.close()
+
+
+def test_two_runs_at_once_share_no_bus_no_port_and_no_memory_and_never_hear_each_other(laid_out):
+    first, second = laid_out("first"), laid_out("second")
+    one, two = (fleet.plan.folder / "output" for fleet in (first, second))
+    settings = [json.loads((folder / "drone_1.json").read_text()) for folder in (one, two)]
+    assert settings[0]["bus_url"] != settings[1]["bus_url"]
+    worlds = [json.loads((folder / "world.json").read_text()) for folder in (one, two)]
+    ports = Counter(
+        port
+        for world in worlds
+        for table in ("mavlink_ports", "radio_ports", "ether_ports")
+        for port in world[table].values()
+    )
+    assert max(ports.values()) == 1
+    rings = [each["drivers"]["frames"]["options"]["run"] for each in settings]
+    assert rings[0] != rings[1]
+
+    heard: dict[int, list[bytes]] = {0: [], 1: []}
+    buses = [lcm.LCM(each["bus_url"]) for each in settings]
+    for number, bus in enumerate(buses):
+        bus.subscribe(".*", lambda _channel, data, number=number: heard[number].append(data))
+    for number, bus in enumerate(buses):
+        bus.publish(channels.TRACK, bytes([number]))
+        deadline = time.monotonic() + 10
+        while not heard[number]:  # its own word comes back: so would the other's have come
+            assert time.monotonic() < deadline
+            bus.handle_timeout(100)
+    assert [bus.handle_timeout(50) for bus in buses] == [0, 0]
+    assert heard == {0: [b"\0"], 1: [b"\1"]}
+
+
+def test_a_run_removes_what_a_dead_run_of_its_slot_left_behind_and_nobody_elses(laid_out):
+    left = [SHARED_FOLDER / f"podwatch_s{number}xdead_1_ring" for number in range(N_SLOTS)]
+    try:
+        for path in left:
+            path.touch()
+        fleet = laid_out("run")
+        number = fleet._slot.number
+        assert not left[number].exists()
+        assert left[-1].exists()
+        assert fleet._page_path.exists()
+        fleet.close()
+        assert not fleet._page_path.exists()
+    finally:
+        for path in left:
+            path.unlink(missing_ok=True)
+
+
+def test_a_slot_stays_taken_until_the_last_process_of_its_run_has_ended():
+    slot = Slot()
+    number = slot.number
+    holder = subprocess.Popen(["cat"], stdin=subprocess.PIPE, pass_fds=[slot.fileno()])
+    slot.close()
+    with Slot() as other:
+        assert other.number != number
+    assert holder.stdin is not None
+    holder.stdin.close()
+    holder.wait(timeout=10)
+    lock = (Path(tempfile.gettempdir()) / f"podwatch-slot-{number}.lock").open("r+")
+    with lock:
+        fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
