@@ -1,6 +1,7 @@
 """One peer as the relay sees it: when it was heard, how its clock stands, what waits for it and what was
 sent to it."""
 
+from collections import deque
 from dataclasses import dataclass, field
 
 from lcmtypes import channels, make
@@ -14,6 +15,7 @@ __all__ = ["LINK_KIND", "NEVER_MS", "KindAccount", "Link"]
 LINK_KIND = "link"  # the relay's own datagrams, beside the channels' names
 LATEST_US = 2_000_000  # a datagram that was under way for longer was held back somewhere: not believed
 UNMEASURED_US = 50_000  # taken for the time under way while the peer's clock is not measured
+N_STAMPS = 200  # datagrams sent that an echo may still name: several seconds of them
 NEVER_MS = 2**31 - 1
 
 
@@ -43,6 +45,7 @@ class Link:
     accounts: dict[str, KindAccount] = field(default_factory=_accounts)
     heard_us: int | None = None  # when a datagram came last
     heard_by_peer_us: int | None = None  # when the peer last said that it hears us
+    sent_stamps_us: deque[int] = field(default_factory=lambda: deque(maxlen=N_STAMPS))
     peer_stamp_us: int = 0  # of the datagram heard last, peer's clock
     is_knocking: bool = False  # the peer calls in a session that it has not proven: it needs our challenge
     n_rejected: int = 0
@@ -66,7 +69,8 @@ class Link:
         """A believed datagram came."""
         self.heard_us, self.peer_stamp_us = now_us, body.stamp_us
         clock = body.clock
-        if clock is not None and clock.held_us is not None:
+        # An echo of an earlier life of this relay would compare with a clock that may have begun anew since.
+        if clock is not None and clock.held_us is not None and clock.echo_us in self.sent_stamps_us:
             self.heard_by_peer_us = now_us
             self.clock.add(clock.echo_us, body.stamp_us - clock.held_us, body.stamp_us, now_us)
 

@@ -266,6 +266,7 @@ class Relay:
                 return False
             return self._send(link, datagram.Body(body.stamp_us, body.ages, body.clock), kind, 0, 0, now_us)
         sealed = self.sessions.seal(link.peer_id, plain)
+        link.sent_stamps_us.append(body.stamp_us)
         if self._send_to_radio(link.peer_id, sealed):
             link.window.spend(len(sealed), is_message, now_us)
             link.count_sent(kind, payload, encoded, len(sealed))
