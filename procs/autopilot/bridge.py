@@ -19,7 +19,7 @@ from procs.settings import LimitSettings, Mission
 __all__ = ["Bridge"]
 
 HEARTBEAT_US = 1_000_000  # fact 3
-SILENT_POSITION_US = 3_000_000  # after which the streams are asked for again
+SILENT_POSITION_US = 2_000_000  # after which the streams are asked for again
 # The failsafe must outlast a restart of this process: 2 s until the supervisor acts and up to 3.3 s of
 # imports.
 GROUND_SILENCE_S = 10.0

@@ -7,6 +7,7 @@ import pytest
 
 from drivers.autopilots.ardupilot import Codec, Mode, mavlink
 from drivers.sim.autopilot import SimAutopilot
+from drivers.sim.autopilot_flight import Setpoint
 from drivers.sim.vehicle import Vehicle, Wind
 from lcmtypes import make
 from lcmtypes.podwatch import setpoint_t
@@ -151,6 +152,39 @@ def test_a_goto_said_during_the_climb_waits_for_the_height(rig):
     assert rig.state["n_m"] > 20
 
 
+def test_hold_stops_the_climb(rig):
+    rig.fly_until(lambda: rig.state["d_m"] < -8, 30, kind=setpoint_t.TAKEOFF, d_m=-20.0)
+    rig.fly(8, kind=setpoint_t.HOLD)
+    assert -14 < rig.state["d_m"] < -8
+
+
+@pytest.mark.parametrize("at_d_m", [0.5, -6.0], ids=["on the ground", "in the air"])
+def test_a_climb_that_somebody_else_ends_is_taken_up_again(rig, at_d_m):
+    wanted = {"kind": setpoint_t.TAKEOFF, "d_m": -20.0}
+    rig.fly_until(lambda: rig.twin.flight.climbing and rig.state["d_m"] < at_d_m, 30, **wanted)
+    rig.twin.flight.accept(Setpoint(None, (0.0, 0.0, 0.0), None, rig.utime / 1e6))
+    assert not rig.twin.flight.climbing
+    rig.fly_until(lambda: rig.state["d_m"] < -19, 50, **wanted)
+
+
+def test_without_a_fresh_position_only_zero_velocity_is_sent(flying):
+    flying.fly(1, kind=setpoint_t.VELOCITY, vn_m_s=3.0)
+    del flying.twin._streams[mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED]
+    flying.fly(1.5, kind=setpoint_t.VELOCITY, vn_m_s=3.0)
+    assert not flying.state["position_ok"]
+    assert flying.setpoints()[-1].vx == 0
+    flying.fly(4, kind=setpoint_t.VELOCITY, vn_m_s=3.0)  # it asks for the stream again
+    assert flying.setpoints()[-1].vx == pytest.approx(3.0)
+
+
+def test_a_respawned_bridge_leaves_the_brake_of_its_forerunner(flying):
+    flying.fly(3)
+    assert flying.twin.flight.mode == Mode.BRAKE
+    flying.bridge = Bridge(flying.mission, DRONE_ID)
+    flying.fly(5, kind=setpoint_t.VELOCITY, vn_m_s=2.0)
+    assert flying.vehicle.velocity_ned[0] == pytest.approx(2, abs=0.3)
+
+
 def test_position_is_told_in_the_fleets_frame(flying):
     """The autopilot's own origin is at its home: its local position there is 0, the fleet's is HOME."""
     assert (flying.state["n_m"], flying.state["e_m"]) == pytest.approx(HOME, abs=0.2)
@@ -205,6 +239,25 @@ def test_an_expired_setpoint_never_reaches_the_autopilot(flying):
     assert flying.state["n_expired"] == before + 2  # this one, and the last live one that ran out
     assert all(m.vx < 7.0 for m in flying.setpoints())
     assert flying.setpoints()[-1].vx == 0
+
+
+def test_a_setpoint_that_claims_a_long_life_dies_after_2_s(flying):
+    flying.say(life_s=3600, kind=setpoint_t.VELOCITY, vn_m_s=3.0)
+    flying.fly(1.9)
+    assert flying.setpoints()[-1].vx == pytest.approx(3.0)
+    flying.fly(0.2)
+    assert flying.setpoints()[-1].vx == 0
+
+
+def test_an_older_setpoint_that_comes_late_changes_nothing(flying):
+    late = make(
+        setpoint_t, utime=flying.utime, drone_id=DRONE_ID, expiry_utime=flying.utime + 10**6, vn_m_s=9.0
+    )
+    late.kind = setpoint_t.VELOCITY
+    flying.fly(0.2, kind=setpoint_t.VELOCITY, vn_m_s=1.0)
+    flying.bridge.setpoint(late, flying.utime)
+    flying.fly(0.2)
+    assert flying.setpoints()[-1].vx == pytest.approx(1.0)
 
 
 def test_silence_means_zero_velocity_at_once_and_brake_a_second_later(flying):
@@ -272,16 +325,34 @@ def test_streams_are_asked_for_again_after_the_autopilot_restarts(rig):
     rig.fly(6)
     assert rig.state["position_ok"]
     rig.twin.restart(rig.utime / 1e6)
-    rig.fly(1.5)
+    rig.sent.clear()
+    rig.fly(2.9)
+    assert len({m.param1 for m in rig.commands(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL)}) == 5
     assert not rig.state["position_ok"]
     rig.fly(8)
     assert rig.state["position_ok"]
     rig.take_off()
 
 
+def test_all_is_asked_for_again_after_a_gap_in_the_heartbeats(rig):
+    rig.fly(6)
+    rig.bridge_alive = False
+    rig.fly(4)
+    rig.twin.restart(rig.utime / 1e6)
+    rig.bridge_alive = True
+    rig.sent.clear()
+    rig.fly(1.5)
+    assert len(rig.commands(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL)) == 5
+    names = [m.param_id for m in rig.sent if m.get_type() == "PARAM_SET"]
+    assert sorted(names) == sorted(set(names))
+    assert "FS_GCS_ENABLE" in names
+
+
 def test_the_ground_station_failsafe_is_set_and_brings_the_vehicle_home(flying):
-    assert flying.twin.flight.parameters["FS_GCS_ENABLE"] == 1
-    timeout_s = flying.twin.flight.parameters["FS_GCS_TIMEOUT"]
+    parameters = flying.twin.flight.parameters
+    assert (parameters["FS_GCS_ENABLE"], parameters["FENCE_ENABLE"], parameters["FENCE_TYPE"]) == (1, 1, 3)
+    assert parameters["FENCE_RADIUS"] > flying.mission.limits.fence_radius_m
+    timeout_s = parameters["FS_GCS_TIMEOUT"]
     flying.fly(2, kind=setpoint_t.HOLD)
     flying.bridge_alive = False
     flying.fly(timeout_s - 1)
@@ -322,7 +393,9 @@ def test_the_fence_holds_in_wind_and_noise():
     rig.fly(25, kind=setpoint_t.VELOCITY, vn_m_s=10.0, ve_m_s=2.0)
     assert 50 < math.hypot(rig.state["n_m"], rig.state["e_m"]) < 61
     assert rig.state["n_clamped"] > 100
+    n_clamped = rig.state["n_clamped"]
     rig.fly(15, kind=setpoint_t.GOTO, n_m=0.0, e_m=500.0, d_m=-200.0)
+    assert rig.state["n_clamped"] - n_clamped == pytest.approx(150, abs=1)
     assert math.hypot(rig.state["n_m"], rig.state["e_m"]) < 61
     assert -rig.state["d_m"] < rig.mission.limits.max_height_m + 1
     assert rig.twin.flight.mode == Mode.GUIDED
