@@ -19,7 +19,7 @@ def bus_url(drone_id: int, slot: int) -> str:
 
 
 class Slot:
-    """The lowest slot that nobody holds; free again when it is closed here and in whoever inherited its lock."""
+    """The lowest slot that nobody holds; free when it is closed here and in whoever inherited its lock."""
 
     def __init__(self) -> None:
         self.number, self._file = _lock_lowest()
