@@ -207,22 +207,43 @@ def pair_success(
     }
 
 
+def _is_in_another_view(row: int, view: View, others: list[View]) -> bool:
+    """Whether the ground under a box lies a body inside another camera's image."""
+    box = view.boxes[row]
+    ground = apply_homography(CAMERA.image_to_ground(view.pose), ((box[:2] + box[2:]) / 2)[None])
+    for other in others:
+        place = apply_homography(CAMERA.ground_to_image(other.pose), ground)[0]
+        depth = min(*place, *(IMAGE_SIZE - place))
+        if depth > float(np.linalg.norm(box[2:] - box[:2])) * view.pose.height_m / other.pose.height_m:
+            return True
+    return False
+
+
 def is_ring_right(views: list[View], registration: RingRegistration) -> bool:
     """Every animal that two views hold has one id in all of them, no two share one, and no false alarm has
-    any."""
+    an id but one of its own, where no other view could deny it.
+    """
     holders: dict[int, int] = {}
     for view in views:
         for animal in view.animals.tolist():
             holders[animal] = holders.get(animal, 0) + 1
     id_of: dict[int, int] = {}
-    for view, identities in zip(views, registration.identities, strict=True):
-        for animal, identity in zip(view.animals.tolist(), identities.tolist(), strict=True):
-            if animal < 0 or holders[animal] < 2:
-                if animal < 0 and identity >= 0:
+    false_ids: list[int] = []
+    for index, (view, identities) in enumerate(zip(views, registration.identities, strict=True)):
+        others = views[:index] + views[index + 1 :]
+        for row, (animal, identity) in enumerate(
+            zip(view.animals.tolist(), identities.tolist(), strict=True)
+        ):
+            if animal < 0 and identity >= 0:
+                if _is_in_another_view(row, view, others):
                     return False
-            elif identity < 0 or id_of.setdefault(animal, identity) != identity:
-                return False
-    return len({*id_of.values()}) == len(id_of)
+                false_ids.append(identity)
+            elif animal >= 0 and holders[animal] >= 2:
+                is_same_id = identity >= 0 and id_of.setdefault(animal, identity) == identity
+                if not is_same_id:
+                    return False
+    owners = [*id_of.values(), *false_ids]
+    return len(dict.fromkeys(owners)) == len(owners)
 
 
 def ring_success(cell: Cell, trials: int, seed: int) -> dict[str, float]:
