@@ -29,7 +29,7 @@ MAX_ORDERS = 6  # newest first; 13 bytes each
 ORDER = struct.Struct(">qBBBH")
 NO_ANIMAL = 255
 COUNTER_STEP_US = 100_000
-# A row this much younger than ours comes from a clock that began anew, whatever its counter.
+# Rows whose ages differ by this much against their counters are of two lives of their drone's clock.
 RESTART_US = 1_000_000
 SAME_FIND_M = 1.0
 
@@ -194,9 +194,10 @@ class FleetTable:
         known = self._entries.get(member)
         if known is not None:
             ahead = (heard.row.counter - known.row.counter) % COUNTER_RANGE
-            is_newer = 0 < ahead < COUNTER_RANGE // 2
-            has_restarted = ahead >= COUNTER_RANGE // 2 and heard.born_us > known.born_us + RESTART_US
-            if not is_newer and not has_restarted:
+            is_ahead = 0 < ahead < COUNTER_RANGE // 2
+            younger_us = heard.born_us - known.born_us
+            # Of two lives of a drone's clock the younger row counts; within one life the counter does.
+            if ahead == 0 or younger_us < -RESTART_US or (not is_ahead and younger_us <= RESTART_US):
                 return
         self._entries[member] = heard
 

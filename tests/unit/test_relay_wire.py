@@ -145,6 +145,22 @@ def test_a_table_is_within_its_limit_and_comes_back_whole_in_time(said: list[Row
     assert sink.order_for(n_orders, 1_000).utime_us == (999 + n_orders if n_orders else 0)
 
 
+def test_a_row_of_an_earlier_life_of_a_drones_clock_does_not_come_back() -> None:
+    ids = (0, 1, 2, 3)
+    old_life, new_life, sink = FleetTable(2, ids), FleetTable(2, ids), FleetTable(1, ids)
+    now_us = 500_000_000
+    old_life.say(row_at(animal=1), now_us, now_us)
+    old = old_life.pack(1, now_us)
+    sink.merge(2, old, now_us)
+    clock_us = 20_000_000  # drone 2 booted again: its counter is behind
+    new_life.say(row_at(animal=2), clock_us, clock_us)
+    sink.merge(2, new_life.pack(1, clock_us), now_us + 5_000_000)
+    assert sink.rows((), now_us)[0].animal == 2
+    aged = with_age(old[1:16], 5_500_000)
+    sink.merge(3, old[:1] + aged + old[16:], now_us + 5_500_000)  # by another path
+    assert sink.rows((), now_us)[0].animal == 2
+
+
 @cases(deadline=None, max_examples=100)
 @given(noise=st.binary(max_size=60))
 def test_noise_in_a_table_is_refused_and_changes_nothing(noise: bytes) -> None:
