@@ -58,6 +58,7 @@ class Settings:
     side: int = 320  # what the exported network takes
     early_share: float = 0.6  # of the steps, at the early side
     photograph_share: float = 0.5  # of the samples; the rest are rendered
+    empty_share: float = 0.2  # of the rendered samples at least: boats and foam must not pass for whales
     letterbox_share: float = 0.35  # cameras are wide, the network's input is square
     scenes: int = 3000  # rendered once: more of them cost disk and time, crops vary them
     scenes_seed: int = 0
@@ -141,7 +142,8 @@ def _batch(
         if photos and rng.random() < settings.photograph_share:
             sample = photograph_sample(photos, empty, rng, side)
         else:
-            sample = scene_sample(rendered[int(rng.integers(len(rendered)))], rng, side)
+            pool = empty if empty and rng.random() < settings.empty_share else rendered
+            sample = scene_sample(pool[int(rng.integers(len(pool)))], rng, side)
         sample = Sample(augment(sample.image, rng), sample.boxes)
         if rng.random() < settings.letterbox_share:
             sample = letterboxed(sample, rng)
