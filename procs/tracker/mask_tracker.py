@@ -212,7 +212,7 @@ class MaskTracker:
         return None
 
     def _adopt(self, first: FirstLook) -> Track:
-        """Take a first look for the truth."""
+        """Take a first look for what is really there."""
         if self._reference is None or self._state == "lost" or not self._near(first.body):
             self._motion.jump(first.body.centre)
         else:

@@ -1,6 +1,7 @@
 """supervisord for a simulated fleet: its configuration from the process table, and talking to it."""
 
 import configparser
+import contextlib
 import os
 import signal
 import subprocess
@@ -19,11 +20,12 @@ __all__ = ["Supervisor", "SupervisorError", "configuration", "program"]
 
 STOP_WAIT_S = 6
 START_TRIES = 5
+WORLD = "world"
 ONE_THREAD = "OMP_NUM_THREADS=1,OPENBLAS_NUM_THREADS=1,MKL_NUM_THREADS=1"
 
 
 class SupervisorError(Exception):
-    """The process tree cannot start or has fallen; the message says which process, why, and where its output is."""
+    """The process tree cannot start or has fallen; the message says which process, why, and where it wrote."""
 
 
 def program(drone_id: int, process: str) -> str:
@@ -32,7 +34,7 @@ def program(drone_id: int, process: str) -> str:
 
 
 def configuration(folder: Path, socket: Path, roster: tuple[int, ...]) -> configparser.RawConfigParser:
-    """The whole tree: the world, and a group a drone with a program for each row of the process table."""
+    """The whole tree: the world, and for each drone a program for each row of the process table."""
     config = configparser.RawConfigParser()
     config["unix_http_server"] = {"file": str(socket), "chmod": "0700"}
     config["supervisord"] = {
@@ -45,26 +47,33 @@ def configuration(folder: Path, socket: Path, roster: tuple[int, ...]) -> config
     factory = "supervisor.rpcinterface:make_main_rpcinterface"
     config["rpcinterface:supervisor"] = {"supervisor.rpcinterface_factory": factory}
     config["supervisorctl"] = {"serverurl": f"unix://{socket}"}
-    config["program:world"] = {
+    config[f"program:{WORLD}"] = {
         "command": f"{sys.executable} -m tools.sim.world_process {folder / 'output' / 'world.json'}",
         "priority": "1",
-        **_common(folder, "world"),
+        **_common(folder, WORLD),
         "autorestart": "false",
     }
+    groups: dict[int, list[str]] = {}
     for drone_id in roster:
-        names = []
         for process in processes.PROCESSES:
             name = program(drone_id, process.name)
-            names.append(name)
+            groups.setdefault(process.stop_order, []).append(name)
             settings = folder / "output" / f"drone_{drone_id}.json"
             config[f"program:{name}"] = {
                 "command": f"{sys.executable} -m procs.main {process.name} {settings} --end-with-parent",
-                "priority": str(1000 - 100 * process.stop_order),
                 **_common(folder, name),
                 "autorestart": "unexpected" if process.restart_ground is Restart.ALWAYS else "false",
             }
-        config[f"group:drone_{drone_id}"] = {"programs": ",".join(names)}
+    # supervisord stops group after group, the highest priority first, and waits for each.
+    for stop_order, names in groups.items():
+        priority = str(1000 - 100 * stop_order)
+        config[f"group:{_group(stop_order)}"] = {"programs": ",".join(names), "priority": priority}
     return config
+
+
+def _group(stop_order: int) -> str:
+    """supervisord's name of all that stops together."""
+    return f"stop_{stop_order}"
 
 
 def _common(folder: Path, name: str) -> dict[str, str]:
@@ -116,28 +125,38 @@ class Supervisor:
 
     def states(self) -> dict[str, tuple[str, int]]:
         """Program -> (supervisord's word for its state, pid); empty while supervisord does not answer yet."""
-        try:
-            rows: Any = _proxy(self._socket).supervisor.getAllProcessInfo()
-        except (OSError, HTTPException, Fault):
-            return {}
-        return {row["name"]: (row["statename"], row["pid"]) for row in rows}
+        return {row["name"]: (row["statename"], row["pid"]) for row in self._rows()}
 
     def check(self) -> None:
         """Raise SupervisorError where supervisord has died, or a process cannot start."""
         if not self.is_alive:
             raise SupervisorError(f"supervisord ended with code {self._popen.returncode}; see {self._output}")
-        for name, (state, _) in self.states().items():
-            if state in ("FATAL", "EXITED"):
+        for row in self._rows():
+            name, state = row["name"], row["statename"]
+            # What was killed is EXITED too, for the moment until it is started again.
+            is_final = state == "EXITED" and (name == WORLD or row["exitstatus"] == EXIT_CANNOT_START)
+            if state == "FATAL" or is_final:
                 output = (self._output / f"{name}.txt").read_text(errors="replace").strip()
                 last = output.splitlines()[-1] if output else "it said nothing"
                 raise SupervisorError(f"{name} cannot run: {last} (all it said: {self._output / name}.txt)")
 
+    def _rows(self) -> list[dict[str, Any]]:
+        """supervisord's account of each program; empty while it does not answer."""
+        try:
+            rows: Any = _proxy(self._socket).supervisor.getAllProcessInfo()
+        except (OSError, HTTPException, Fault):
+            return []
+        return list(rows)
+
     def drop_drone(self, drone_id: int, pids: list[int]) -> None:
-        """End a whole drone at once: freeze its processes, so that it says nothing more, then have them removed."""
+        """End a whole drone at once: freeze its processes, so that it says nothing more, then remove them."""
         for pid in pids:
             if pid:
                 os.kill(pid, signal.SIGSTOP)
-        _proxy(self._socket).supervisor.stopProcessGroup(f"drone_{drone_id}", False)
+        for process in processes.PROCESSES:
+            name = f"{_group(process.stop_order)}:{program(drone_id, process.name)}"
+            with contextlib.suppress(Fault):  # it was not running
+                _proxy(self._socket).supervisor.stopProcess(name, False)
 
     def stop(self) -> None:
         """Stop the tree in its order and wait for it."""
@@ -153,6 +172,6 @@ class Supervisor:
 
 def _proxy(socket: Path) -> Any:
     """A new connection for each call: supervisor's transport cannot go on after one that failed."""
-    from supervisor.xmlrpc import SupervisorTransport  # noqa: PLC0415 - slow to import
+    from supervisor.xmlrpc import SupervisorTransport  # slow to import
 
     return ServerProxy("http://127.0.0.1", transport=SupervisorTransport(None, None, f"unix://{socket}"))
