@@ -45,7 +45,8 @@ class FakeRun:
     n_animals: int = 5
     duration_s: float = 40.0
     monitor_s: tuple[float, float] = (10.0, 35.0)
-    track_hz: float = 10.0
+    track_hz: float = 5.0
+    truth_hz: float = 10.0
     watch: Callable[[int, float], int] = lambda drone, t_s: drone
     name: Callable[[int, int, float], int] = lambda drone, animal, t_s: animal + 10
     aim_off_m: Callable[[int, float], float] = lambda drone, t_s: 0.0
@@ -110,7 +111,7 @@ class FakeRun:
         return Pose(n_m, e_m, min(d_m, -0.1), sway, -sway, 0.8 * drone + 0.05 * t_s)
 
     def truth(self) -> Truth:
-        t_s = np.arange(0, self.duration_s, 0.05)
+        t_s = np.arange(0, self.duration_s, 1 / self.truth_hz)
         return Truth(
             CAMERA,
             t_s,
@@ -158,10 +159,10 @@ class FakeRun:
         makers = {
             channels.MISSION_STATE: (5.0, self._mission_state),
             channels.TRACK: (self.track_hz, self._track),
-            channels.IDENTITIES: (5.0, self._identities),
+            channels.IDENTITIES: (2.5, self._identities),
             channels.ASSIGNMENT: (2.0, self._assignment),
-            channels.SETPOINT: (10.0, self._setpoint),
-            channels.VEHICLE_STATE: (10.0, self._vehicle_state),
+            channels.SETPOINT: (5.0, self._setpoint),
+            channels.VEHICLE_STATE: (5.0, self._vehicle_state),
             channels.LINK_STATE: (1.0, self._link_state),
             channels.PREVIEW: (1.0, self._preview),
         }
@@ -203,7 +204,7 @@ class FakeRun:
 
     def _write_truth(self, folder: Path) -> None:
         writer = LogWriter(folder / "truth.mcap", drone_id=0)
-        for seq, t_s in enumerate(np.arange(0, self.duration_s, 0.05)):
+        for seq, t_s in enumerate(np.arange(0, self.duration_s, 1 / self.truth_hz)):
             writer.write(channels.WORLD_STATE, self._world(seq, float(t_s)).encode(), round(t_s * 1e6))
         writer.close()
         about = {
