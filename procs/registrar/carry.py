@@ -16,9 +16,13 @@ __all__ = ["BoxCarrier", "Sighting"]
 Array = NDArray[np.float64]
 
 KEEP_US = 8_000_000  # frames remembered, and how long an unseen animal is
-GATE_LENGTHS = 0.6
-GATE_SPEED_M_S = 2.0
-MAX_GATE_LENGTHS = 1.2
+# How far an animal may be from where it is expected, once the shift that all boxes share is out: a share of its length,
+# and more the longer it was unseen. Tight, since a pod's animals lie about a length apart.
+GATE_LENGTHS = 0.25
+GATE_SPEED_M_S = 0.7
+MAX_GATE_LENGTHS = 0.6
+MAX_SHIFT_LENGTHS = 0.8  # shared by all boxes: an error of attitude, height or position
+SHIFT_PRICE = 0.5  # of one matched animal, for the largest shift
 VELOCITY_GAIN = 0.15
 MAX_SPEED_M_S = 4.0
 
@@ -68,16 +72,25 @@ class BoxCarrier:
         self._followed: list[Followed] = []
         self.sightings: deque[Sighting] = deque()
 
-    def update(self, utime: int, boxes: Array, ground_m: Array) -> Sighting:
-        """Add one detected frame: boxes (N, 4) px and their centres on the ground (N, 2) m, own NED frame."""
+    def update(
+        self, utime: int, boxes: Array, ground_m: Array, whole: NDArray[np.bool_] | None = None
+    ) -> Sighting:
+        """Add one detected frame: boxes (N, 4) px and their centres on the ground (N, 2) m, own NED frame.
+
+        whole (N,): False for a box that the picture's edge cuts: its centre is not the animal's, so nobody is followed
+        by it.
+        """
         self._followed = [animal for animal in self._followed if utime - animal.utime <= KEEP_US]
-        matches = self._associate(utime, ground_m)
+        rows = np.flatnonzero(whole) if whole is not None else np.arange(len(boxes))
+        matches = {int(rows[k]): animal for k, animal in self._associate(utime, ground_m[rows]).items()}
+        is_whole = set(rows.tolist())
         seen: list[Followed] = []
         for row, position in enumerate(ground_m):
             animal = matches.get(row)
             if animal is None:
                 animal = Followed(position.copy(), utime)
-                self._followed.append(animal)
+                if row in is_whole:
+                    self._followed.append(animal)
             else:
                 _move(animal, position, utime)
             seen.append(animal)
@@ -121,13 +134,28 @@ class BoxCarrier:
         gate = np.minimum(
             GATE_LENGTHS * self._length_m + GATE_SPEED_M_S * unseen_s, MAX_GATE_LENGTHS * self._length_m
         )
-        # An error of the drone's attitude moves all boxes alike: take that common shift out before the last match.
-        shift = np.zeros(2)
-        rows, columns = _match(ground_m, predicted, gate)
-        if len(rows):
-            shift = np.median(ground_m[rows] - predicted[columns], axis=0)
-            rows, columns = _match(ground_m - shift, predicted, gate)
+        shift = _shared_shift(ground_m, predicted, gate, MAX_SHIFT_LENGTHS * self._length_m)
+        rows, columns = _match(ground_m - shift, predicted, gate)
         return {int(row): self._followed[column] for row, column in zip(rows, columns, strict=True)}
+
+
+def _shared_shift(points: Array, predicted: Array, gate: Array, limit_m: float) -> Array:
+    """(2,) m: the shift of all points together under which most of them meet a prediction; none where it gains nothing.
+
+    An error of the drone's attitude or position moves all boxes alike, at times by more than half the distance between
+    animals. Each pair (point, prediction) proposes one shift; a large one must earn its price in matches.
+    """
+    proposals = (points[:, None] - predicted[None]).reshape(-1, 2)
+    proposals = np.vstack([np.zeros(2), proposals[np.linalg.norm(proposals, axis=1) <= limit_m]])
+    moved = points[None] - proposals[:, None]  # (shifts, points, 2)
+    distance = np.linalg.norm(
+        moved[:, :, None] - predicted[None, None], axis=3
+    )  # (shifts, points, predictions)
+    closeness = np.clip(1 - (distance / gate) ** 2, 0, None)
+    price = SHIFT_PRICE * (np.linalg.norm(proposals, axis=1) / limit_m) ** 2
+    # The best match of a point and of a prediction, whichever says less: cheap, and no point counts for two.
+    score = np.minimum(closeness.max(axis=2).sum(axis=1), closeness.max(axis=1).sum(axis=1)) - price
+    return np.asarray(proposals[int(np.argmax(score))])
 
 
 def _match(points: Array, predicted: Array, gate: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

@@ -26,6 +26,7 @@ DETECTED_AFTER_US = 450_000  # by then the detector has said what it found at t
 SECOND_LOOK_US = 1_200_000  # a pair's second instant, at least 1 s after the first
 SAID_AFTER_END_US = 1_500_000  # a finished drone repeats its packets, so that the others end too
 SEEN_NOW_US = 1_000_000
+EDGE_PX = 3.0  # a box this near to the edge is cut by it
 # An unnamed box this near to a mapped animal that no box here is, and far from its rivals, for so many
 # sights running is that animal.
 TAKE_UP_LENGTHS = 0.4
@@ -112,10 +113,16 @@ class Registrar:
             return None
         centres = (boxes[:, :2] + boxes[:, 2:]) / 2
         ground = apply_homography(self._camera.image_to_ground(pose), centres)
-        sighting = self.carrier.update(utime, boxes, ground)
+        sighting = self.carrier.update(utime, boxes, ground, self._whole(boxes))
         if self.finished is not None and self.running is None:
             self._take_up(sighting, pose)
         return sighting, self._note_sights(sighting, pose, fleet_utime)
+
+    def _whole(self, boxes: Array) -> NDArray[np.bool_]:
+        """(N,) whether a box lies clear of the picture's edges."""
+        width, height = self._camera.image_size
+        low, high = boxes[:, :2] > EDGE_PX, boxes[:, 2:] < (width - EDGE_PX, height - EDGE_PX)
+        return np.asarray((low & high).all(axis=1))
 
     def propose(self, members: tuple[int, ...], utime: int, fleet_utime: int) -> None:
         """Begin a new episode unless one is under way or about to be."""
