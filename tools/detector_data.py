@@ -98,7 +98,7 @@ def read_yolo(images: Sequence[Path], labels: Path) -> list[Sample]:
 
 
 def _with_halves(image: Image, boxes: Boxes, levels: int = 4) -> Sample:
-    if levels == 0:
+    if levels == 0 or min(image.shape[:2]) < 4:
         return Sample(image, boxes)
     half = np.asarray(cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), np.uint8)
     return Sample(image, boxes, _with_halves(half, boxes * _row([0.5, 0.5, 0.5, 0.5, 1]), levels - 1))
