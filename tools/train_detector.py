@@ -184,8 +184,15 @@ class _Run:
         torch.save(state, part)
         part.replace(path)  # whole or not at all: a kill while writing keeps the last one
 
-    def load(self, path: Path) -> None:
+    def load(self, path: Path, settings: Settings) -> None:
+        """Take up a checkpoint; says so where it was made with other settings, since the run is then not
+        repeatable.
+        """
         state = torch.load(path, weights_only=True)
+        for name, now in asdict(settings).items():
+            before = state["settings"].get(name)
+            if before != now:
+                print(f"{path}: {name} was {before} up to step {state['step']}, now {now}", flush=True)
         self.network.load_state_dict(state["network"])
         self.optimiser.load_state_dict(state["optimiser"])
         self.average, self.step, self.seconds = state["average"], state["step"], state["seconds"]
@@ -239,7 +246,7 @@ def train(out: Path, settings: Settings, data: Path | None = None, stop_after: i
     print(f"{len(rendered)} rendered scenes ({len(empty)} empty), {len(photos)} photographs", flush=True)
     run, checkpoint, log = _start(settings), out / "checkpoint.pt", out / "log.csv"
     if checkpoint.is_file():
-        run.load(checkpoint)
+        run.load(checkpoint, settings)
         print(f"goes on at step {run.step} of {settings.steps}", flush=True)
     grids = {side: cell_centres(side, side) for side in (settings.early_side, settings.side)}
     run.network.train()
@@ -337,6 +344,8 @@ def command(
     """
     settings = Settings(seed=seed, steps=steps)
     if smoke:
+        out = out / "smoke"
+        (out / "checkpoint.pt").unlink(missing_ok=True)  # always from the beginning
         settings = Settings(
             seed=seed, steps=6, batch=4, scenes=12, early_side=128, warmup_steps=2, save_every_steps=3
         )
