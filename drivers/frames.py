@@ -1,7 +1,8 @@
 """Pixels between processes: a ring of frames in shared memory, and its counterpart in one process's memory.
 
-A frame_t handle names ring, token and slot; a reader copies the slot and checks the frame's number before and after, so a frame
-that was overwritten, or a ring that was made anew, reads as "gone" (None), never as other pixels.
+A frame_t handle names ring, token and slot; a reader copies the slot and checks the frame's number before and
+after, so a frame that was overwritten, or a ring that was made anew, reads as "gone" (None), never as other
+pixels.
 """
 
 import mmap
@@ -26,7 +27,8 @@ WRITING = -1
 class SharedFrames:
     """A drone's frame ring in /dev/shm: the camera writes, detector and tracker read.
 
-    `run` and `drone_id` name it; what an earlier camera of the same run and drone left behind is removed at the first write.
+    `run` and `drone_id` name it; what an earlier camera of the same run and drone left behind is removed at
+    the first write.
     """
 
     def __init__(self, run: str, drone_id: int, slots: int = 16) -> None:

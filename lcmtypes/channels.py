@@ -1,7 +1,7 @@
 """The channel table: every channel of a drone's bus, once. All else that knows a channel derives from here.
 
-Publishers, the relay's allow-list, the logger, health checks, the spy and the docs read `CHANNELS`; code names a channel by
-the constants (`channels.FRAME`), never by a string.
+Publishers, the relay's allow-list, the logger, health checks, the spy and the docs read `CHANNELS`; code
+names a channel by the constants (`channels.FRAME`), never by a string.
 """
 
 from dataclasses import dataclass
@@ -81,7 +81,7 @@ def split_received(name: str) -> tuple[int, str] | None:
 
 
 def kind_of(name: str) -> type[Any] | None:
-    """The message type of a channel or of a neighbour's copy of it, None where the table has no such channel."""
+    """The message type of a channel or of a neighbour's copy of it, None for a channel not in the table."""
     copy = split_received(name)
     channel = BY_NAME.get(copy[1] if copy else name)
     return channel.kind if channel else None

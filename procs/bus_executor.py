@@ -1,8 +1,9 @@
 """The executor on a real bus: one process, one select loop, one LCM handle.
 
-Traps of lcm 1.5.3 that shape it: a signal during `handle()` raises OSError, so the loop waits in select and handles only what
-is there; the C queue drops the newest message when it is full, so it is made deep and drained at once into the
-runtime's own queues; an LCM made before a fork is broken, so it is made here, after the process has started.
+Traps of lcm 1.5.3 that shape it: a signal during `handle()` raises OSError, so the loop waits in select and
+handles only what is there; the C queue drops the newest message when it is full, so it is made deep and
+drained at once into the runtime's own queues; an LCM made before a fork is broken, so it is made here, after
+the process has started.
 """
 
 import importlib
@@ -28,7 +29,10 @@ DEFAULT_CLOCK = DriverSpec(driver="drivers.clocks.monotonic:MonotonicClock")
 
 
 def load_driver(spec: DriverSpec) -> Any:
-    """The driver that `spec` names, made with its options. Raises RuntimeFailure naming what is wrong."""
+    """The driver that `spec` names, made with its options. Raises RuntimeFailure naming what is wrong.
+
+    A driver is any class that the settings name, so any error of its making is the settings' or the machine's.
+    """
     module, _, name = spec.driver.partition(":")
     try:
         factory = getattr(importlib.import_module(module), name)
@@ -36,7 +40,11 @@ def load_driver(spec: DriverSpec) -> Any:
         raise RuntimeFailure(
             f"driver {spec.driver}: cannot be loaded ({error}); check its name in the settings"
         ) from error
-    return factory(**spec.options)
+    try:
+        return factory(**spec.options)
+    except Exception as error:
+        said = str(error) or type(error).__name__
+        raise RuntimeFailure(f"driver {spec.driver}: {said} (its options are in the settings)") from error
 
 
 class BusRuntime(Runtime):
@@ -44,7 +52,7 @@ class BusRuntime(Runtime):
 
     def __init__(self, process: str, settings: DroneSettings) -> None:
         self._clock = load_driver(settings.drivers.get("clock", DEFAULT_CLOCK))
-        self._now = self._clock.utime()
+        self._now: int = self._clock.utime()
         super().__init__(process, settings)
         try:
             self._lcm = lcm.LCM(settings.bus_url)
@@ -54,6 +62,7 @@ class BusRuntime(Runtime):
                 "ip route add 224.0.0.0/4 dev lo"
             ) from error
         self._transports: list[tuple[Transport, Callable[[], None]]] = []
+        self._ready: list[Any] = []
         self._raw: list[tuple[str, bytes]] = []
         self._running = True
         self._cpu_s = 0.0
@@ -136,9 +145,8 @@ class BusRuntime(Runtime):
         wait_s = min(max(self._clock.real_seconds((due - self._now) / 1e6), 0.0), LONGEST_WAIT_S)
         if self._next_waiting() is not None:
             wait_s = 0.0
-        self._ready, _, _ = select.select(
-            [self._lcm, self._wake_read, *(t for t, _ in self._transports)], [], [], wait_s
-        )
+        sources: list[Any] = [self._lcm, self._wake_read, *(transport for transport, _ in self._transports)]
+        self._ready, _, _ = select.select(sources, [], [], wait_s)
 
     def _drain(self) -> None:
         """Take what waits out of LCM's queue, so that it never fills."""

@@ -1,4 +1,6 @@
-"""What a process remembers of the vehicle: its pose at the instant when a frame was taken, not when it was handled."""
+"""What a process remembers of the vehicle: its pose at the instant when a frame was taken, not when it was
+handled.
+"""
 
 from bisect import bisect_left
 from collections import deque

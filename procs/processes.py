@@ -17,8 +17,9 @@ class Restart(Enum):
 class Process:
     """One process of a drone.
 
-    `compute_s` is the nominal time of one handler: it delays the process's outputs in virtual time. `stop_order`: the
-    lowest is stopped first, so that the bridge still hears the navigator and the logger hears everybody.
+    `compute_s` is the nominal time of one handler: it delays the process's outputs in virtual time.
+    `stop_order`: the lowest is stopped first, so that the bridge still hears the navigator and the logger
+    hears everybody.
     """
 
     name: str

@@ -1,8 +1,10 @@
-"""The executor in virtual time: every process of every drone in one operating-system process, one event queue.
+"""The executor in virtual time: every process of every drone in one operating-system process, one event
+queue.
 
-Events are ordered by (time, drone, process, sequence of scheduling), so the same seed gives the same run. A handler that says something takes its
-process's nominal compute time (process table): what it said arrives that much later, and the process is busy until then. Messages cross
-as encoded bytes and each hearer decodes its own copy, as on a real bus.
+Events are ordered by (time, drone, process, sequence of scheduling), so the same seed gives the same run. A
+handler that says something takes its process's nominal compute time (process table): what it said arrives
+that much later, and the process is busy until then. Messages cross as encoded bytes and each hearer decodes
+its own copy, as on a real bus.
 """
 
 import heapq

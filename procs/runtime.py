@@ -1,9 +1,10 @@
 """The runtime: what a process's shell may use, and what both executors share.
 
-A shell is a module with `setup(runtime)`. It registers handlers with `on` and `every` and says messages with `publish`; it never
-loops, sleeps, reads a clock, opens a socket or starts a thread. Two executors drive it: `procs.bus_executor` (a select loop on
-a real bus) and `procs.queue_executor` (a queue in virtual time). Queue capacity, newest-only and gap counting are done
-here, the same in both (DESIGN section 2: LCM's own full queue drops the *newest* message).
+A shell is a module with `setup(runtime)`. It registers handlers with `on` and `every` and says messages with
+`publish`; it never loops, sleeps, reads a clock, opens a socket or starts a thread. Two executors drive it:
+`procs.bus_executor` (a select loop on a real bus) and `procs.queue_executor` (a queue in virtual time). Queue
+capacity, newest- only and gap counting are done here, the same in both (DESIGN section 2: LCM's own full
+queue drops the *newest* message).
 """
 
 import struct
@@ -117,8 +118,9 @@ class Runtime(ABC):
     ) -> None:
         """Call `handler(message)` for each message of `channel`.
 
-        newest: only the newest message that waits is handled, older ones are dropped and counted. capacity: where more
-        wait, the oldest are dropped and counted. Raises ValueError for an unknown channel or a second handler.
+        newest: only the newest message that waits is handled, older ones are dropped and counted. capacity:
+        where more wait, the oldest are dropped and counted. Raises ValueError for an unknown channel or a
+        second handler.
         """
         if channels.kind_of(channel) is None:
             raise ValueError(f"channel {channel!r} is not in the channel table (lcmtypes/channels.py)")
@@ -207,8 +209,8 @@ class Runtime(ABC):
         except (ValueError, struct.error, IndexError, UnicodeDecodeError, MemoryError) as error:
             self._counts["bad"] += 1
             self.degraded(
-                f"{subscription.channel}: a message of {len(data)} bytes does not decode as {kind.__name__} ({error}); "
-                "is every process of the same podwatch version?",
+                f"{subscription.channel}: a message of {len(data)} bytes does not decode as {kind.__name__} "
+                f"({error}); is every process of the same podwatch version?",
                 cause=f"decode {subscription.channel}",
             )
             return

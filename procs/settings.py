@@ -1,4 +1,6 @@
-"""What a mission file may say, and what one drone's processes are told. Validated by pydantic; an unknown key is refused."""
+"""What a mission file may say, and what one drone's processes are told. Validated by pydantic; an unknown key
+is refused.
+"""
 
 from __future__ import annotations
 
@@ -24,8 +26,13 @@ __all__ = [
 ]
 
 
+MAX_DRONES = 63  # members travel as a bitmap of 64 bits, signed
+
+
 class MissionError(Exception):
-    """A mission, fleet or settings file that cannot be flown; the message names the key, the value and the remedy."""
+    """A mission, fleet or settings file that cannot be flown; the message names the key, the value and the
+    remedy.
+    """
 
 
 class Section(BaseModel):
@@ -108,7 +115,7 @@ class LimitSettings(Section):
 class RadioSettings(Section):
     """The ring's links."""
 
-    bytes_per_s: int = Field(6000, ge=500, le=1_000_000)  # cap for each link, headers and seal counted
+    bytes_per_s: int = Field(6000, ge=1500, le=1_000_000)  # cap for each link, headers and seal counted
     lost_after_s: float = Field(3.0, ge=1, le=30)
     key_file: str = "fleet.key"
 
@@ -136,6 +143,8 @@ class Mission(Section):
     @model_validator(mode="after")
     def _consistent(self) -> Self:
         ids = [drone.id for drone in self.drones]
+        if len(ids) > MAX_DRONES:
+            raise ValueError(f"drones: {len(ids)} entries; a fleet holds at most {MAX_DRONES}")
         if not ids:
             raise ValueError("drones: at least one [[drones]] entry is needed")
         for drone_id in ids:
@@ -168,7 +177,9 @@ class Mission(Section):
 
 
 class DriverSpec(Section):
-    """A driver by name, `package.module:Class`, and its options: how a process gets its edge without knowing which."""
+    """A driver by name, `package.module:Class`, and its options: how a process gets its edge without knowing
+    which.
+    """
 
     driver: str = Field(pattern=r"^[\w.]+:\w+$")
     options: dict[str, Any] = {}
@@ -200,7 +211,8 @@ S = TypeVar("S", bound=Mission)
 def load_mission(path: Path, model: type[S]) -> S:
     """Read and validate a TOML mission file as `model` (Mission or a subclass).
 
-    Raises MissionError: unreadable file, TOML syntax, unknown key (with the nearest valid one), value out of range.
+    Raises MissionError: unreadable file, TOML syntax, unknown key (with the nearest valid one), value out of
+    range.
     """
     try:
         data = tomllib.loads(path.read_text())

@@ -25,11 +25,13 @@ app.add_typer(bench, name="bench")
 
 @app.command("views")
 def views(
-    pictures: Annotated[list[Path], typer.Argument(help="Pictures or videos of one scene from several viewpoints.")],
+    pictures: Annotated[
+        list[Path], typer.Argument(help="Pictures or videos of one scene from several viewpoints.")
+    ],
     out: Annotated[Path, typer.Option(help="The figure to write.")] = Path("views.png"),
 ) -> None:
     """Detect, register round the ring and assign, on pictures that stand for several drones' views."""
-    from tools.views import command  # noqa: PLC0415
+    from tools.views import command
 
     with plain_errors():
         command(pictures, out)
@@ -38,7 +40,7 @@ def views(
 @app.command("report")
 def report(folder: Annotated[Path, typer.Argument(help="A run's folder.")]) -> None:
     """Write report.html (and summary.json) of a run's folder anew."""
-    from tools.sim.run import finish  # noqa: PLC0415
+    from tools.sim.run import finish
 
     with plain_errors():
         finish(folder)
@@ -55,24 +57,30 @@ def render(
     height: Annotated[int, typer.Option(min=64)] = 480,
 ) -> None:
     """Render labelled scenes for training and validation."""
-    from tools.render import command  # noqa: PLC0415
+    from tools.render import command
 
     command(out, n, seed, split, width, height)
 
 
 @train.command("detector")
 def train_detector(
-    out: Annotated[Path, typer.Option(help="Folder for checkpoints, log and export.")] = Path("runs/detector"),
-    data: Annotated[Path | None, typer.Option(help="A data.yaml in the YOLO layout to train on as well.")] = None,
+    out: Annotated[Path, typer.Option(help="Folder for checkpoints, log and export.")] = Path(
+        "runs/detector"
+    ),
+    data: Annotated[
+        Path | None, typer.Option(help="A data.yaml in the YOLO layout to train on as well.")
+    ] = None,
     steps: Annotated[int | None, typer.Option(min=1)] = None,
     seed: Annotated[int, typer.Option(min=0)] = 0,
     smoke: Annotated[bool, typer.Option("--smoke", help="A few steps, export and check only.")] = False,
 ) -> None:
     """Train the detector and export it to ONNX."""
     try:
-        from tools.train_detector import Settings, command  # noqa: PLC0415
+        from tools.train_detector import Settings, command
     except ImportError as error:
-        typer.echo(f"podwatch: {error.name} is missing; install the extra: pip install 'podwatch[train]'", err=True)
+        typer.echo(
+            f"podwatch: {error.name} is missing; install the extra: pip install 'podwatch[train]'", err=True
+        )
         raise typer.Exit(3) from None
     command(out, data, Settings.steps if steps is None else steps, seed, smoke)
 
@@ -81,10 +89,12 @@ def train_detector(
 def bench_fleet(
     seeds: Annotated[int, typer.Option(min=1, help="Default missions in lockstep.")] = 10,
     out: Annotated[Path, typer.Option(help="Folder for the runs and the table.")] = Path("runs/bench"),
-    quick: Annotated[bool, typer.Option("--quick", help="Boxes in place of pixels, no processes mode.")] = False,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Boxes in place of pixels, no processes mode.")
+    ] = False,
 ) -> None:
     """Fly many missions and print every figure of the fleet."""
-    from tools.bench_fleet import command  # noqa: PLC0415
+    from tools.bench_fleet import command
 
     with plain_errors():
         command(seeds, out, quick=quick)

@@ -1,40 +1,62 @@
 """Errors that a person meets at the command line: one line on stderr and an exit code, never a traceback.
 
-    1  the mission was flown and did not succeed, or a process tree fell
-    2  what was given cannot be used: a file, an option, a value
-    3  this machine lacks something: a route, a model, a key
+1  what was asked for was tried and failed: a process tree fell, no animal was found
+2  what was given cannot be used: a file, an option, a value
+3  this machine lacks something: a route, a model, a key, room on the disk
+130  stopped by Ctrl-C
 """
 
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 import typer
 
-from drivers.sim.render.scene import SurfaceError
-from logs.exceptions import LogError
-from procs.detector.yolo import ModelError
-from procs.relay.keys import FleetKeyError
-from procs.runtime import RuntimeFailure
-from procs.settings import MissionError
-
-__all__ = ["FAILED", "MISSING", "UNUSABLE", "plain_errors"]
+__all__ = ["FAILED", "INTERRUPTED", "MISSING", "UNUSABLE", "exit_code_of", "plain_errors"]
 
 FAILED, UNUSABLE, MISSING = 1, 2, 3
-EXIT_CODES: dict[type[Exception], int] = {
-    MissionError: UNUSABLE,
-    LogError: UNUSABLE,
-    SurfaceError: UNUSABLE,
-    ModelError: MISSING,
-    FleetKeyError: MISSING,
-    RuntimeFailure: MISSING,
+INTERRUPTED = 130  # as shells say of SIGINT
+# By name, so that a command imports no more than it needs: what was raised has been imported.
+EXIT_CODES = {
+    ("procs.settings", "MissionError"): UNUSABLE,
+    ("logs.exceptions", "LogError"): UNUSABLE,
+    ("drivers.sim.render.scene", "SurfaceError"): UNUSABLE,
+    ("tools.evidence", "EvidenceError"): UNUSABLE,
+    ("tools.views", "ViewsError"): UNUSABLE,
+    ("procs.detector.decode", "ModelError"): MISSING,
+    ("procs.relay.keys", "FleetKeyError"): MISSING,
+    ("procs.runtime", "RuntimeFailure"): MISSING,
+    ("tools.sim.supervision", "SupervisorError"): FAILED,
 }
 
 
 @contextmanager
 def plain_errors() -> Iterator[None]:
-    """Turn the errors that a user can cause or mend into one line and an exit code."""
+    """Turn the errors that a user can cause or mend into one line and an exit code.
+
+    An OSError that nobody foresaw (a full disk, a file that vanished) is told with its file; what is left is a
+    fault of ours and keeps its traceback.
+    """
     try:
         yield
-    except tuple(EXIT_CODES) as error:
-        typer.echo(f"podwatch: {error}", err=True)
-        raise typer.Exit(next(code for kind, code in EXIT_CODES.items() if isinstance(error, kind))) from None
+    except Exception as error:
+        code = exit_code_of(error)
+        if code is None:
+            raise
+        typer.echo(f"podwatch: {_told(error)}", err=True)
+        raise typer.Exit(code) from None
+
+
+def exit_code_of(error: Exception) -> int | None:
+    """The exit code of an error that a user can cause or mend, None of any other."""
+    for (module, name), code in EXIT_CODES.items():
+        kind = getattr(sys.modules.get(module), name, None)
+        if kind is not None and isinstance(error, kind):
+            return code
+    return MISSING if isinstance(error, OSError) else None
+
+
+def _told(error: Exception) -> str:
+    if isinstance(error, OSError) and error.strerror and error.filename:
+        return f"{error.filename}: {error.strerror}; check the path, its permissions and the room on the disk"
+    return str(error)

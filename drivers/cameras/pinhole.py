@@ -1,7 +1,8 @@
 """The pinhole camera under a drone: pixels to ground metres and back.
 
-The camera looks straight down the body's z axis; the top of the image is the drone's nose. Pixels are (u right, v down)
-from the top-left corner; the ground is the plane d = 0 of a local NED frame; angles are aerospace roll, pitch, yaw.
+The camera looks straight down the body's z axis; the top of the image is the drone's nose. Pixels are
+(u right, v down) from the top-left corner; the ground is the plane d = 0 of a local NED frame; angles are
+aerospace roll, pitch, yaw.
 """
 
 from dataclasses import dataclass
@@ -9,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Pinhole", "Pose", "apply_homography", "body_to_ned"]
+__all__ = ["Pinhole", "Pose", "apply_homography", "body_to_ned", "inverse"]
 
 Array = NDArray[np.float64]
 
@@ -19,7 +20,7 @@ CAMERA_TO_BODY = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
 @dataclass(frozen=True)
 class Pose:
-    """Where a drone is: NED metres in a local frame (d is minus the height above the surface), angles in radians."""
+    """Where a drone is: NED metres in a local frame (d is minus the height above the surface), radians."""
 
     n_m: float
     e_m: float
@@ -74,7 +75,7 @@ class Pinhole:
         to_camera = (body_to_ned(pose.roll_rad, pose.pitch_rad, pose.yaw_rad) @ CAMERA_TO_BODY).T
         # A ground point (n, e, 0) minus the camera's position, as a linear function of (n, e, 1).
         from_camera = np.array([[1.0, 0, -pose.n_m], [0, 1.0, -pose.e_m], [0, 0, -pose.d_m]])
-        return self.intrinsics @ to_camera @ from_camera
+        return np.asarray(self.intrinsics @ to_camera @ from_camera, dtype=np.float64)
 
     def image_to_ground(self, pose: Pose) -> Array:
         """(3, 3) homography from pixels (u, v, 1) to ground (n, e, 1) in metres.
@@ -82,12 +83,17 @@ class Pinhole:
         Raises ValueError when the camera is not above the surface: no ground is in view then.
         """
         if pose.height_m <= 0:
-            raise ValueError(f"height {pose.height_m:.2f} m: the camera must be above the surface to see the ground")
-        return np.linalg.inv(self.ground_to_image(pose))
+            raise ValueError(f"height {pose.height_m:.2f} m: a camera sees the ground only from above it")
+        return inverse(self.ground_to_image(pose))
 
     def metres_per_px(self, height_m: float) -> float:
         """Ground sample distance at the nadir."""
         return height_m / self.focal_px
+
+
+def inverse(homography: Array) -> Array:
+    """(3, 3) the way back. Raises numpy.linalg.LinAlgError for a homography that has none."""
+    return np.asarray(np.linalg.inv(homography), dtype=np.float64)
 
 
 def apply_homography(homography: Array, points: Array) -> Array:

@@ -1,7 +1,8 @@
-"""`--sensor boxes`: a detector and a tracker with calibrated errors in place of pixels, for large batches of runs.
+"""`--sensor boxes`: a detector and a tracker with calibrated errors in place of pixels, for large batches of
+runs.
 
-They read the table that `drivers.sim.camera.BoxPainter` wrote into the image. The errors are those of our own detector on rendered seas: each
-edge off by a share of the side, a few animals missed, a few false alarms.
+They read the table that `drivers.sim.camera.BoxPainter` wrote into the image. The errors are those of our own
+detector on rendered seas: each edge off by a share of the side, a few animals missed, a few false alarms.
 """
 
 import struct

@@ -1,4 +1,4 @@
-"""The simulated camera: what a drone would see, drawn from the world's true state at the instant of capture."""
+"""The simulated camera: what a drone would see, drawn from the true state at the instant of capture."""
 
 import struct
 from collections.abc import Callable, Sequence
@@ -47,7 +47,9 @@ def animal_views(state: world_state_t, ahead_s: float = 0.0, *, poster: bool = F
 
 
 class SimCamera:
-    """Renders one drone's view. `look` gives (true state, seconds since it was true, simulation time in s) or None."""
+    """Renders one drone's view. `look` gives (true state, seconds since it was true, simulation time in s) or
+    None.
+    """
 
     def __init__(
         self,
@@ -110,7 +112,7 @@ class BoxPainter:
 
 
 def _box(camera: Pinhole, pose: Pose, animal: AnimalView) -> tuple[float, float, float, float] | None:
-    """Axis-aligned box of an animal's body ellipse in the image, clipped; None where its centre is outside."""
+    """Box of an animal's body ellipse in the image, clipped; None where its centre is outside."""
     angle = np.linspace(0, 2 * np.pi, 20, endpoint=False)
     along, across = animal.length_m / 2 * np.cos(angle), 0.11 * animal.length_m * np.sin(angle)
     ch, sh = np.cos(animal.heading_rad), np.sin(animal.heading_rad)

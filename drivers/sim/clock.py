@@ -1,6 +1,8 @@
-"""One simulation clock for every process of a run: a page of shared memory that says how simulation time follows real time.
+"""One simulation clock for every process of a run: a page of shared memory that says how simulation time
+follows real time.
 
-The world owns the page. When processes fall behind it slows the clock instead of letting setpoints die; nobody else notices.
+The world owns the page. When processes fall behind it slows the clock instead of letting setpoints die;
+nobody else notices.
 """
 
 import mmap

@@ -25,7 +25,9 @@ class UdpEther:
         loss: float,
         ether_ports: Mapping[int, int],
     ) -> None:
-        """`radio_ports`: where each drone's radio listens. `ether_ports`: where the others send what is meant for it."""
+        """`radio_ports`: where each drone's radio listens. `ether_ports`: where the others send what is meant
+        for it.
+        """
         self._radio_ports = dict(radio_ports)
         self._sender_of = {port: drone_id for drone_id, port in radio_ports.items()}
         self._random = random

@@ -1,6 +1,8 @@
-"""Animals that swim: a pod on a slow course, each animal about its own place in it, kept apart from the others.
+"""Animals that swim: a pod on a slow course, each animal about its own place in it, kept apart from the
+others.
 
-A simulator's model, not a claim about whales: speeds and distances are those of resting and slowly travelling groups.
+A simulator's model, not a claim about whales: speeds and distances are those of resting and slowly travelling
+groups.
 """
 
 from dataclasses import dataclass
@@ -39,7 +41,7 @@ class PodSettings:
 
 
 def place_animals(settings: PodSettings, random: np.random.Generator) -> Array:
-    """(N, 2) places (n, e) within the pod's radius, `spacing_m` apart; ValueError where so many do not fit."""
+    """(N, 2) places (n, e) within the pod's radius, `spacing_m` apart; ValueError where they do not fit."""
     places = np.zeros((0, 2))
     for _ in range(20_000):
         if len(places) == settings.n_animals:
@@ -51,8 +53,8 @@ def place_animals(settings: PodSettings, random: np.random.Generator) -> Array:
             places = np.vstack([places, place])
     if len(places) < settings.n_animals:
         raise ValueError(
-            f"{settings.n_animals} animals {settings.spacing_m} m apart do not fit within {settings.radius_m} m "
-            f"(found room for {len(places)}); widen pod.radius_m or lower pod.spacing_m"
+            f"{settings.n_animals} animals {settings.spacing_m} m apart do not fit within "
+            f"{settings.radius_m} m (found room for {len(places)}); widen pod.radius_m or lower pod.spacing_m"
         )
     return places + (settings.north_m, settings.east_m)
 

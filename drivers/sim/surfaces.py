@@ -1,4 +1,6 @@
-"""The simulated world's surface by its settings: a rendered sea or lawn, a photograph, a video, or boxes in place of pixels."""
+"""The simulated world's surface by its settings: a rendered sea or lawn, a photograph, a video, or boxes in
+place of pixels.
+"""
 
 from pathlib import Path
 
@@ -21,7 +23,8 @@ def open_scene(
 ) -> Surface:
     """The surface that every simulated camera of a run looks at.
 
-    scene: "" for the rendered `kind` ("sea" or "grass"), else a picture's or video's path, `width_m` wide about `centre_ne`. Raises SurfaceError.
+    scene: "" for the rendered `kind` ("sea" or "grass"), else a picture's or video's path, `width_m` wide
+    about `centre_ne`. Raises SurfaceError.
     """
     if sensor == "boxes":
         return BoxPainter()

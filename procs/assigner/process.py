@@ -1,8 +1,10 @@
-"""The assigner: decides with the ring who watches which animal, and moves nobody before all are known to differ.
+"""The assigner: decides with the ring who watches which animal, and moves nobody before all are known to
+differ.
 
-Hears IDENTITIES (an episode that ended in consensus begins an exchange), VEHICLE_STATE, FLEET_STATE (members that are lost, orders to leave an animal) and
-the neighbours' RING_ASSIGN. Says RING_ASSIGN at 5 Hz while an exchange runs and slowly after it, and ASSIGNMENT at 2 Hz and at
-every change. Until the certificate holds, the drone keeps the animal that it has.
+Hears IDENTITIES (an episode that ended in consensus begins an exchange), VEHICLE_STATE, FLEET_STATE (members
+that are lost, orders to leave an animal) and the neighbours' RING_ASSIGN. Says RING_ASSIGN at 5 Hz while an
+exchange runs and slowly after it, and ASSIGNMENT at 2 Hz and at every change. Until the certificate holds,
+the drone keeps the animal that it has.
 """
 
 import numpy as np

@@ -1,8 +1,8 @@
 """The camera: takes an image from its driver at the mission's rate and says where its pixels are.
 
-Hears nothing. Says FRAME (a handle; the pixels stay in the frame ring) at camera.rate_hz and PREVIEW (a small JPEG) at
-camera.preview_hz. An image of the wrong size or type is dropped, counted and named in the heartbeat; a camera that gives nothing
-for a second, or black images, is named too, and the rest of the drone goes on.
+Hears nothing. Says FRAME (a handle; the pixels stay in the frame ring) at camera.rate_hz and PREVIEW (a small
+JPEG) at camera.preview_hz. An image of the wrong size or type is dropped, counted and named in the heartbeat;
+a camera that gives nothing for a second, or black images, is named too, and the rest of the drone goes on.
 """
 
 import cv2
@@ -31,26 +31,35 @@ class Camera:
         self._shape = (settings.height_px, settings.width_px, 3)
         self._number = 0
         self._image: NDArray[np.uint8] | None = None
+        self._given_utime = runtime.utime  # when the driver gave its last image, good or bad
         self._last_utime = runtime.utime
+        self._n_refused = 0
         self._previewed = -1
 
     def capture(self) -> None:
         """Take one image and say its handle."""
         runtime = self._runtime
-        image = self._driver.capture()
+        try:
+            image = self._driver.capture()
+            runtime.ok("driver")
+        except OSError as error:
+            runtime.degraded(f"the camera fails: {error}; is it connected?", cause="driver")
+            image = None
         if image is None:
-            silent_s = (runtime.utime - self._last_utime) / 1e6
+            silent_s = (runtime.utime - self._given_utime) / 1e6
             if silent_s > SILENT_AFTER_S:
                 runtime.degraded(f"no image for {silent_s:.1f} s; is the camera connected?", cause="silent")
             return
-        if image.dtype != np.uint8 or image.shape != self._shape:
+        self._given_utime = runtime.utime
+        runtime.ok("silent")
+        if not isinstance(image, np.ndarray) or image.dtype != np.uint8 or image.shape != self._shape:
+            self._n_refused += 1
             runtime.degraded(
-                f"the camera gave {image.shape} {image.dtype}, the mission wants {self._shape} uint8; "
-                "set [camera] width_px and height_px to what it gives",
+                f"the camera gave {_kind_of(image)}, the mission wants {_size_of(self._shape)} uint8; "
+                f"{self._n_refused} dropped; set [camera] width_px and height_px to what it gives",
                 cause="shape",
             )
             return
-        runtime.ok("silent")
         runtime.ok("shape")
         if int(image[::CHECK_STEP_PX, ::CHECK_STEP_PX].max()) < BLACK_BELOW:
             runtime.degraded("black images; is the lens covered?", cause="black")
@@ -93,6 +102,18 @@ class Camera:
     def close(self) -> None:
         """Give the frame ring back."""
         self._frames.close()
+
+
+def _size_of(shape: tuple[int, ...]) -> str:
+    """ "640x480" of (480, 640, 3), else the shape as it is."""
+    return f"{shape[1]}x{shape[0]}" if len(shape) == 3 and shape[2] == 3 else f"an array of {shape}"
+
+
+def _kind_of(image: object) -> str:
+    """What a driver gave, for people."""
+    if isinstance(image, np.ndarray):
+        return f"{_size_of(image.shape)} {image.dtype}"
+    return f"a {type(image).__name__}"
 
 
 def setup(runtime: Runtime) -> None:

@@ -1,9 +1,12 @@
 """The detector: finds the animals in the newest frame.
 
-Hears FRAME. Says DETECTIONS at most at camera.detect_hz, with the frame's instant of capture; a frame without animals gives a message without
-boxes. A frame that is gone from the ring is skipped and counted. When FRAME dies it falls silent: presence fades and nobody acts on
-old boxes. A model that is missing or broken ends the process with exit code 3 and the remedy.
+Hears FRAME. Says DETECTIONS at most at camera.detect_hz, with the frame's instant of capture; a frame without
+animals gives a message without boxes. A frame that is gone from the ring is skipped and counted. When FRAME
+dies it falls silent: presence fades and nobody acts on old boxes. A model that is missing or broken ends the
+process with exit code 3 and the remedy.
 """
+
+from typing import Any
 
 import numpy as np
 
@@ -44,12 +47,7 @@ class DetectorShell:
             self._runtime.degraded(str(error), cause="detect")
             return
         self._runtime.ok("detect")
-        boxes = [
-            make(box_t, left_px=left, top_px=top, right_px=right, bottom_px=bottom, score=score, class_id=kind)
-            for (left, top, right, bottom), score, kind in zip(
-                found.boxes.tolist(), found.scores.tolist(), np.asarray(found.classes).tolist(), strict=True
-            )
-        ]
+        boxes = self._sound(found)
         self._runtime.publish(
             channels.DETECTIONS,
             make(
@@ -63,6 +61,30 @@ class DetectorShell:
                 boxes=boxes,
             ),
         )
+
+    def _sound(self, found: Any) -> list[box_t]:
+        """The boxes that are numbers; others are left out and told."""
+        sound = np.isfinite(found.boxes).all(axis=1) & np.isfinite(found.scores)
+        if sound.all():
+            self._runtime.ok("nan")
+        else:
+            self._runtime.degraded(
+                f"the detector gave {int((~sound).sum())} boxes that are no numbers, such as "
+                f"{found.boxes[~sound][0].tolist()}; they are left out; export the model again",
+                cause="nan",
+            )
+        rows = zip(
+            found.boxes[sound].tolist(),
+            found.scores[sound].tolist(),
+            np.asarray(found.classes)[sound].tolist(),
+            strict=True,
+        )
+        return [
+            make(
+                box_t, left_px=left, top_px=top, right_px=right, bottom_px=bottom, score=score, class_id=kind
+            )
+            for (left, top, right, bottom), score, kind in rows
+        ]
 
 
 def setup(runtime: Runtime) -> None:

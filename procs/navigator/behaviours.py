@@ -34,6 +34,7 @@ ASK_AFTER_S = 6.0  # the lowest on station asks first, the others when it does n
 ASSIGN_LIMIT_S = 15.0
 GATHER_LIMIT_S = 300.0
 HOLD_LIMIT_S = 15.0
+LEVEL_AT_M = 15.0
 
 
 def idle(now: Situation, memory: Memory, camera: Pinhole) -> Step:
@@ -286,7 +287,7 @@ def return_home(now: Situation, memory: Memory, camera: Pinhole) -> Step:
     away_m = float(np.linalg.norm(goal[:2] - now.position[:2]))
     if away_m > 20.0:
         goal[2] = min(goal[2], now.position[2])
-    step = fly_to(now, goal, now.mission.watch.speed_m_s, climbs_first=False)
+    step = fly_to(now, goal, now.mission.watch.speed_m_s, levels_first=False)
     if away_m < STATION_M and abs(goal[2] - now.position[2]) < STATION_M:
         step.event = Event.HOME
     return step
@@ -324,16 +325,17 @@ def hold(now: Situation, memory: Memory, camera: Pinhole) -> Step:
 
 
 def fly_to(
-    now: Situation, goal: Array, speed_m_s: float, climbs_first: bool = True, feed_ne: Array | None = None
+    now: Situation, goal: Array, speed_m_s: float, levels_first: bool = True, feed_ne: Array | None = None
 ) -> Step:
     """A step towards `goal` (3,), moved inside the fence, that itself moves with `feed_ne` (2,) m/s.
 
-    A far goal at another height is reached by changing height first and then flying level.
+    On the way to a far goal it changes its height, and comes nearer than LEVEL_AT_M only in its own layer.
     """
     goal = inside_fence(goal, now.mission.limits)
     waypoint = goal.copy()
-    away_m = float(np.linalg.norm(goal[:2] - now.position[:2]))
-    if climbs_first and away_m > 10.0 and abs(goal[2] - now.position[2]) > 4.0:
-        waypoint[:2] = now.position[:2]
+    away = now.position[:2] - goal[:2]
+    away_m = float(np.linalg.norm(away))
+    if levels_first and away_m > LEVEL_AT_M and abs(goal[2] - now.position[2]) > 4.0:
+        waypoint[:2] += away * LEVEL_AT_M / away_m
     feed = None if feed_ne is None else np.append(feed_ne, 0.0)
     return Step(goal=goal, velocity=approach(now.position, waypoint, speed_m_s, feed))

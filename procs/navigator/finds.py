@@ -17,6 +17,7 @@ Array = NDArray[np.float64]
 NEAR_M = 40.0  # a drone so near to the pod sees it; a farther one only repeats what it heard
 STRAY_M = 15.0  # boxes further than this outside the pod are not of the pod
 FRESH_MAP_S = 10.0
+INSET = 0.1  # share of the picture's sides near which an animal may be cut off
 PERIOD_S = 0.5  # at which the drift of the find is estimated
 JOIN_S = 10.0  # the watch begins at the latest so long after the first drone's MONITOR
 LOOKING = (State.SCOUT, State.FOUND, State.RENDEZVOUS, State.REGISTER)
@@ -42,7 +43,18 @@ def sense(now: Situation, memory: Memory, camera: Pinhole) -> None:
         points = points[away < memory.find.radius_m + STRAY_M]
     elif memory.gate.share < 0.1:
         memory.barycentre.reset()
-    memory.barycentre.update(points, margin_m=now.mission.watch.animal_length_m / 2)
+    memory.barycentre.update(
+        detections.utime,
+        points,
+        ground_points(camera, pose, _well_inside(camera)),
+        margin_m=now.mission.watch.animal_length_m / 2,
+    )
+
+
+def _well_inside(camera: Pinhole) -> Array:
+    """(4, 2) px corners of the part of the picture in which an animal is seen whole."""
+    corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], dtype=np.float64)
+    return np.asarray((INSET + (1 - 2 * INSET) * corners) * camera.image_size)
 
 
 def share(now: Situation, memory: Memory, camera: Pinhole) -> None:

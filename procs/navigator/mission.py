@@ -29,7 +29,10 @@ __all__ = ["Inputs", "Navigator", "Outputs"]
 Array = NDArray[np.float64]
 Behaviour = Callable[[Situation, Memory, Pinhole], Step]
 
-CLEARANCE_SHARE = 0.6  # of the circle's separation: what is left before drones push each other apart
+# What is left of the circle's separation before drones push each other apart; never so little that the noise
+# of two positions could use it up.
+CLEARANCE_SHARE = 0.6
+LEAST_CLEARANCE_M = 4.5
 
 BEHAVIOURS: dict[State, Behaviour] = {
     State.IDLE: behaviours.idle,
@@ -59,9 +62,9 @@ class Navigator:
         self.camera = Pinhole((camera.width_px, camera.height_px), float(np.radians(camera.vfov_deg)))
         self.memory = Memory(
             gate=PresenceGate(mission.search.presence_frames, mission.search.presence_share),
-            barycentre=Barycentre(),
+            barycentre=Barycentre(reach_m=0.6 * mission.watch.animal_length_m),
             animal_filter=AnimalFilter(mission.watch.max_animal_speed_m_s),
-            find_filter=AnimalFilter(mission.watch.max_animal_speed_m_s, alpha=0.3, beta=0.03),
+            find_filter=AnimalFilter(mission.watch.max_animal_speed_m_s, alpha=0.2, beta=0.01),
         )
         self._velocity: Array | None = (
             None  # last asked for; None where the last setpoint was of another kind
@@ -172,7 +175,7 @@ class Navigator:
             np.array([[row.n_m, row.e_m, row.d_m] for row in rows], dtype=np.float64),
             np.array([[row.vn_m_s, row.ve_m_s, row.vd_m_s] for row in rows], dtype=np.float64),
             np.array([now.row_age_s(row) for row in rows]),
-            CLEARANCE_SHARE * self.mission.watch.separation_m,
+            max(CLEARANCE_SHARE * self.mission.watch.separation_m, LEAST_CLEARANCE_M),
         )
 
     def _setpoint(self, now: Situation, step: Step) -> podwatch.setpoint_t:

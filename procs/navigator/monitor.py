@@ -119,4 +119,4 @@ def _over_animal(now: Situation, memory: Memory, unseen_s: float) -> Step:
     if place is None:
         place = sight if sight is not None else now.position[:2]
     goal = np.array([place[0], place[1], -height_m])
-    return fly_to(now, goal, watch.speed_m_s, climbs_first=False)
+    return fly_to(now, goal, watch.speed_m_s, levels_first=False)

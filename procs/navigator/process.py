@@ -1,8 +1,9 @@
 """The navigator: flies the mission, one setpoint a tenth of a second.
 
-Hears all that says where things are: VEHICLE_STATE, DETECTIONS, IDENTITIES, ASSIGNMENT, TRACK, FLEET_STATE. Says SETPOINT (it dies of age by
-itself) and MISSION_STATE at 10 Hz. When an input dies the core holds, predicts or goes home (docs/navigator.md); when this process dies its
-setpoints expire, the bridge holds the drone, and the next start takes up the state that the fleet still carries.
+Hears all that says where things are: VEHICLE_STATE, DETECTIONS, IDENTITIES, ASSIGNMENT, TRACK, FLEET_STATE.
+Says SETPOINT (it dies of age by itself) and MISSION_STATE at 10 Hz. When an input dies the core holds,
+predicts or goes home (docs/navigator.md); when this process dies its setpoints expire, the bridge holds the
+drone, and the next start takes up the state that the fleet still carries.
 """
 
 from typing import Any

@@ -163,7 +163,7 @@ class Pair:
         """How surely each source mark lies in the target's window (K, N1), and each target in the source's
         (K, N2).
         """
-        inverse = np.linalg.inv(homographies)
+        inverse = np.asarray(np.linalg.inv(homographies), dtype=np.float64)
         back, _ = apply_homographies(inverse, self.target.centres)
         return _inside(mapped, self.target_window), _inside(back, self.source_window)
 

@@ -106,7 +106,7 @@ def _fit(pair: Pair, homographies: Array, columns: Ints, sigma: Array) -> tuple[
     centre[:, 0], centre[:, 1] = alpha.real, alpha.imag
     centre[:, 2:4] = homographies[:, :2, 2]
     full = matrix + ridge[:, :, None] * np.eye(8)
-    solved = np.linalg.solve(full, (right + ridge * centre)[:, :, None])[:, :, 0]
+    solved: Array = np.linalg.solve(full, (right + ridge * centre)[:, :, None])[:, :, 0].astype(np.float64)
     penalty = (ridge[:, 4:] * solved[:, 4:] ** 2).sum(axis=1) / 2
     volume = (np.linalg.slogdet(full)[1] - np.log(ridge[:, 4:]).sum(axis=1)) / 2
     new_alpha2 = np.maximum(solved[:, 0] ** 2 + solved[:, 1] ** 2, 1e-12)

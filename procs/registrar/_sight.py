@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.cameras.pinhole import inverse
 from procs.registrar._chart import ViewGeometry, fits_map, local_view, map_marks, merge_sight, shifted
 from procs.registrar._marks import Marks
 from procs.registrar.box_icp import HEADING_PRIOR_STD_RAD, BoxAlignment, Prior
@@ -85,7 +86,7 @@ class Observer:
         """Ids of the animals that lie well inside this view and that no box of it matched."""
         if self.marks.window is None:
             return [one.id for one in animals if one.id not in sight.ids.values()]
-        back = target.through(np.linalg.inv(sight.to_chart))
+        back = target.through(inverse(sight.to_chart))
         depth = _depth_inside(back.centres, self.marks.window) / np.maximum(back.sizes, 1e-9)
         inside = depth > MISS_DEPTH_SIZES
         return [
@@ -103,7 +104,7 @@ class Observer:
             old = map_marks(known, np.zeros(2), 0.0)
             found = self.register(self.marks.through(to_chart), old, prior=Prior())
             if len(found.matches) >= 2:
-                back = old.through(np.linalg.inv(found.transform))
+                back = old.through(inverse(found.transform))
                 known = [
                     replace(
                         one,

@@ -13,6 +13,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from drivers.cameras.pinhole import inverse
 from procs.registrar._literal import literal_alignment
 from procs.registrar._marks import Marks, check_boxes, marks_from_boxes
 from procs.registrar._pair import Pair, Prior, apply_homographies
@@ -174,7 +175,7 @@ def _transposed(alignment: BoxAlignment, source: Marks, target: Marks) -> BoxAli
     return _alignment(
         source,
         target,
-        np.linalg.inv(alignment.transform) if len(alignment.matches) else np.eye(3),
+        inverse(alignment.transform) if len(alignment.matches) else np.eye(3),
         alignment.matches[:, ::-1],
         alignment.confidence,
         alignment.is_ambiguous,

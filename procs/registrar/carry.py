@@ -1,7 +1,8 @@
 """From the episode's instant to now: the same animal's box from frame to frame, on the ground.
 
-Boxes are followed as points in the drone's own NED frame, so that its own motion drops out. An id given to a box of an
-earlier frame (DESIGN section 4, "from t to now") is then the id of that animal's box in the newest frame.
+Boxes are followed as points in the drone's own NED frame, so that its own motion drops out. An id given to a
+box of an earlier frame (DESIGN section 4, "from t to now") is then the id of that animal's box in the newest
+frame.
 """
 
 from collections import deque
@@ -16,8 +17,8 @@ __all__ = ["BoxCarrier", "Sighting"]
 Array = NDArray[np.float64]
 
 KEEP_US = 8_000_000  # frames remembered, and how long an unseen animal is
-# How far an animal may be from where it is expected, once the shift that all boxes share is out: a share of its length,
-# and more the longer it was unseen. Tight, since a pod's animals lie about a length apart.
+# How far an animal may be from where it is expected, once the shift that all boxes share is out: a share of
+# its length, and more the longer it was unseen. Tight, since a pod's animals lie about a length apart.
 GATE_LENGTHS = 0.25
 GATE_SPEED_M_S = 0.7
 MAX_GATE_LENGTHS = 0.6
@@ -51,7 +52,9 @@ class Followed:
 
 @dataclass(frozen=True)
 class Sighting:
-    """One detected frame: boxes (N, 4) px, ground positions (N, 2) m, and who each box is (index of a followed animal)."""
+    """One detected frame: boxes (N, 4) px, ground positions (N, 2) m, and who each box is (index of a
+    followed animal).
+    """
 
     utime: int
     boxes: Array
@@ -77,8 +80,8 @@ class BoxCarrier:
     ) -> Sighting:
         """Add one detected frame: boxes (N, 4) px and their centres on the ground (N, 2) m, own NED frame.
 
-        whole (N,): False for a box that the picture's edge cuts: its centre is not the animal's, so nobody is followed
-        by it.
+        whole (N,): False for a box that the picture's edge cuts: its centre is not the animal's, so nobody is
+        followed by it.
         """
         self._followed = [animal for animal in self._followed if utime - animal.utime <= KEEP_US]
         rows = np.flatnonzero(whole) if whole is not None else np.arange(len(boxes))
@@ -108,7 +111,7 @@ class BoxCarrier:
         return best if abs(best.utime - utime) <= within_us else None
 
     def name(self, sighting: Sighting, ids: list[int]) -> None:
-        """Give the boxes of an earlier sighting their ids, replacing what was believed; -1 takes a name away."""
+        """Give the boxes of an earlier sighting their ids in place of all that was believed; -1 is none."""
         for animal in self._followed:
             animal.animal = -1
         for animal, animal_id in zip(sighting.followed, ids, strict=True):
@@ -140,10 +143,12 @@ class BoxCarrier:
 
 
 def _shared_shift(points: Array, predicted: Array, gate: Array, limit_m: float) -> Array:
-    """(2,) m: the shift of all points together under which most of them meet a prediction; none where it gains nothing.
+    """(2,) m: the shift of all points together under which most of them meet a prediction; none where it
+    gains nothing.
 
-    An error of the drone's attitude or position moves all boxes alike, at times by more than half the distance between
-    animals. Each pair (point, prediction) proposes one shift; a large one must earn its price in matches.
+    An error of the drone's attitude or position moves all boxes alike, at times by more than half the
+    distance between animals. Each pair (point, prediction) proposes one shift; a large one must earn its
+    price in matches.
     """
     proposals = (points[:, None] - predicted[None]).reshape(-1, 2)
     proposals = np.vstack([np.zeros(2), proposals[np.linalg.norm(proposals, axis=1) <= limit_m]])

@@ -1,7 +1,7 @@
 """Who registers with whom, and when: proposals of episodes (DESIGN section 4, "An episode").
 
-Any drone may propose one; the larger (number, proposer) wins everywhere, so that all end with the same. Proposals are said again
-and again as whole state; a member list never changes within a number.
+Any drone may propose one; the larger (number, proposer) wins everywhere, so that all end with the same.
+Proposals are said again and again as whole state; a member list never changes within a number.
 """
 
 from dataclasses import dataclass

@@ -1,8 +1,10 @@
-"""The registrar: agrees with the ring which animal is which, and names the boxes of the newest detected frame.
+"""The registrar: agrees with the ring which animal is which, and names the boxes of the newest detected
+frame.
 
-Hears DETECTIONS, VEHICLE_STATE, MISSION_STATE (does the navigator want an episode), FLEET_STATE (members, fleet time) and the
-neighbours' RING_EPISODE and RING_MAP. Says IDENTITIES for every detected frame, and RING_EPISODE and RING_MAP at 5 Hz while an episode runs; between episodes
-the map's upkeep at 1 Hz. Without detections it says nothing new; without the fleet it registers alone.
+Hears DETECTIONS, VEHICLE_STATE, MISSION_STATE (does the navigator want an episode), FLEET_STATE (members,
+fleet time) and the neighbours' RING_EPISODE and RING_MAP. Says IDENTITIES for every detected frame, and
+RING_EPISODE and RING_MAP at 5 Hz while an episode runs; between episodes the map's upkeep at 1 Hz. Without
+detections it says nothing new; without the fleet it registers alone.
 """
 
 import numpy as np
@@ -20,8 +22,7 @@ from lcmtypes.podwatch import (
 )
 from procs.history import PoseHistory, camera_of
 from procs.registrar.episodes import from_bitmap, to_bitmap
-from procs.registrar.registrar import Registrar, RingPacket
-from procs.registrar.registrar import UPKEEP
+from procs.registrar.registrar import UPKEEP, Registrar, RingPacket
 from procs.registrar.upkeep import UpkeepError
 from procs.runtime import Runtime
 
@@ -134,6 +135,7 @@ class RegistrarShell:
             self._registrar.receive(
                 RingPacket(message.episode, message.proposer, message.instant, bytes(message.packet))
             )
+            self._go_on()  # at once: a lap of n hops would take n steps of the timer
             return
         finished = self._registrar.finished
         if finished and (message.episode, message.proposer) == (finished.number, finished.proposer):
@@ -150,7 +152,10 @@ class RegistrarShell:
         said = registrar.book.saying(self._fleet_utime)
         if said is not None:
             runtime.publish(channels.RING_EPISODE, said)
-        for packet in registrar.step(runtime.utime, self._fleet_utime, self._poses.at):
+        self._go_on()
+
+    def _go_on(self) -> None:
+        for packet in self._registrar.step(self._runtime.utime, self._fleet_utime, self._poses.at):
             self._say(packet)
 
     def keep_up(self) -> None:

@@ -1,7 +1,8 @@
-"""The registrar's core: episodes of the ring, identities carried to the newest frame, the map kept up between episodes.
+"""The registrar's core: episodes of the ring, identities carried to the newest frame, the map kept up between
+episodes.
 
-Plain objects with time as an argument. The bus shell (process.py) feeds it detections, poses and the neighbours' packets and says
-what it returns.
+Plain objects with time as an argument. The bus shell (process.py) feeds it detections, poses and the
+neighbours' packets and says what it returns.
 """
 
 from collections.abc import Callable
@@ -11,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.cameras.pinhole import Pinhole, Pose, apply_homography
+from procs.registrar.box_icp import BoxAlignment
 from procs.registrar.carry import BoxCarrier, Sighting
 from procs.registrar.episodes import EpisodeBook, Proposal
 from procs.registrar.map import Memory
@@ -89,7 +91,7 @@ class Registrar:
         animal_length_m: float,
         episode_limit_s: float,
         began_utime: int,
-        register: Callable[..., object] | None = None,
+        register: Callable[..., BoxAlignment] | None = None,
     ) -> None:
         self._drone_id = drone_id
         self._camera = camera
@@ -108,7 +110,9 @@ class Registrar:
     def detected(
         self, utime: int, boxes: Array, pose: Pose | None, fleet_utime: int
     ) -> tuple[Sighting, dict[int, float]] | None:
-        """Take one detected frame -> (its sighting, residual in metres to the map by animal id); None without a pose."""
+        """Take one detected frame -> (its sighting, residual in metres to the map by animal id); None without
+        a pose.
+        """
         if pose is None or pose.height_m <= 1.0:
             return None
         centres = (boxes[:, :2] + boxes[:, 2:]) / 2
@@ -290,7 +294,8 @@ class Registrar:
                 MapEntry(
                     animal=one.id,
                     position_m=np.array([one.n_m, one.e_m]),
-                    seen_fleet_utime=look.t_utime,
+                    # Remembered but not seen this time: its age goes on.
+                    seen_fleet_utime=look.t_utime if one.hits else self._seen_before(one.id),
                     mine=one.id in mine,
                     size_m=one.size_m,
                     axis_rad=one.axis_rad,
@@ -301,8 +306,15 @@ class Registrar:
             ]
         )
 
+    def _seen_before(self, animal: int) -> int:
+        """Fleet time at which an animal was last seen, 0 where this drone never knew it."""
+        entry = self.map.entries.get(animal)
+        return entry.seen_fleet_utime if entry is not None else 0
+
     def _take_up(self, sighting: Sighting, pose: Pose) -> None:
-        """Name boxes that have no name by the map, where one animal alone is near enough (DESIGN section 4, MONITOR)."""
+        """Name boxes that have no name by the map, where one animal alone is near enough (DESIGN section 4,
+        MONITOR).
+        """
         held = set(self.carrier.held_ids(sighting.utime, SEEN_NOW_US))
         free = [entry for entry in self.map.entries.values() if entry.animal not in held]
         unnamed = [

@@ -1,7 +1,7 @@
 """The fleet's map between episodes: where each agreed animal was last seen, by anybody.
 
-Each drone says all that it knows, 6 bytes an animal, again and again; the newest sight of an animal wins. Positions are in the map's
-frame; `Correction` carries a point from a drone's own frame into it.
+Each drone says all that it knows, 6 bytes an animal, again and again; the newest sight of an animal wins.
+Positions are in the map's frame; `Correction` carries a point from a drone's own frame into it.
 """
 
 import struct
@@ -87,7 +87,9 @@ class MapBook:
         self.entries = {entry.animal: entry for entry in sorted(entries, key=lambda entry: entry.animal)}
 
     def saw(self, animal: int, position_m: Array, fleet_utime: int) -> float:
-        """Our own sight of an animal -> its distance from the newest sight by another drone, 0 where there is no fresh one."""
+        """Our own sight of an animal -> its distance from the newest sight by another drone, 0 where there is
+        no fresh one.
+        """
         entry = self.entries.get(animal)
         if entry is None:
             return 0.0
@@ -100,7 +102,8 @@ class MapBook:
         """What to say to the neighbours now."""
         rows = []
         for entry in list(self.entries.values())[:MAX_ANIMALS]:
-            # Rounded up: rounded to the nearest, an animal that nobody sees would grow younger as it goes round.
+            # Rounded up: rounded to the nearest, an animal that nobody sees would grow younger as it goes
+            # round.
             age = -(-max(fleet_utime - entry.seen_fleet_utime, 0) // AGE_UNIT_US)
             if age < OLDEST:
                 age |= SAW_IT if entry.mine else 0
@@ -125,7 +128,8 @@ class MapBook:
             position = np.array([n_dm, e_dm]) / 10
             if age & SAW_IT and (entry.theirs_m is None or seen >= entry.theirs_fleet_utime):
                 entry.theirs_m, entry.theirs_fleet_utime = position, seen
-            # Our own sight comes back to us from the neighbours, a little older: only a clearly newer one counts.
+            # Our own sight comes back to us from the neighbours, a little older: only a clearly newer one
+            # counts.
             if seen > entry.seen_fleet_utime + AGE_UNIT_US:
                 entry.position_m, entry.seen_fleet_utime, entry.mine = position, seen, False
 

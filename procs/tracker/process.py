@@ -1,8 +1,9 @@
 """The tracker: a mask of the assigned animal in every frame.
 
-Hears FRAME, IDENTITIES, ASSIGNMENT and VEHICLE_STATE. Says TRACK for every frame while it has an animal, and at 2 Hz that it has none. It starts on the
-very frame in which the registrar named the animal (still in the frame ring) and catches up; the animal's later boxes hold it against
-drift and take it up again when it was lost. Without IDENTITIES it goes on by itself; without FRAME it falls silent and the navigator predicts.
+Hears FRAME, IDENTITIES, ASSIGNMENT and VEHICLE_STATE. Says TRACK for every frame while it has an animal, and
+at 2 Hz that it has none. It starts on the very frame in which the registrar named the animal (still in the
+frame ring) and catches up; the animal's later boxes hold it against drift and take it up again when it was
+lost. Without IDENTITIES it goes on by itself; without FRAME it falls silent and the navigator predicts.
 """
 
 from collections import deque
@@ -122,19 +123,25 @@ class TrackerShell:
             self._drop()
             self._state = track_t.LOST
 
-    def _named(self, utime: int, within_us: int) -> tuple[identities_t, NDArray[np.float64], NDArray[np.float64]] | None:
+    def _named(
+        self, utime: int, within_us: int
+    ) -> tuple[identities_t, NDArray[np.float64], NDArray[np.float64]] | None:
         """The newest identities that name the animal, its box (4,) and the others' boxes (K, 4)."""
         identities = self._identities
         if identities is None or utime - identities.utime > within_us:
             return None
-        boxes = np.array([[b.left_px, b.top_px, b.right_px, b.bottom_px] for b in identities.boxes], dtype=float)
+        boxes = np.array(
+            [[b.left_px, b.top_px, b.right_px, b.bottom_px] for b in identities.boxes], dtype=float
+        )
         own = [row for row, animal in enumerate(identities.ids) if animal == self._animal]
         if len(own) != 1:
             return None
         return identities, boxes[own[0]], np.delete(boxes, own[0], axis=0)
 
     def _image_motion(self, early_utime: int, late_utime: int) -> NDArray[np.float64] | None:
-        """(3, 3) homography from the last frame's pixels to this one's, from the vehicle's motion over a flat surface."""
+        """(3, 3) homography from the last frame's pixels to this one's, from the vehicle's motion over a flat
+        surface.
+        """
         early, late = self._poses.at(early_utime), self._poses.at(late_utime)
         if early is None or late is None or min(early.height_m, late.height_m) < 1.0:
             return None

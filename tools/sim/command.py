@@ -1,26 +1,29 @@
 """`podwatch sim`: fly a simulated fleet, judge it, and leave a folder with logs, summary and report."""
 
+import difflib
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 
 import fleets
+from drivers.sim.render import open_surface
 from procs.settings import DroneEntry, MissionError, load_mission, validate
-from tools.errors import FAILED, plain_errors
+from tools.errors import INTERRUPTED, plain_errors
 from tools.live import LiveView
 from tools.sim.buses import has_multicast_route
 from tools.sim.plan import RunPlan
 from tools.sim.run import finish, fly_lockstep, fly_processes, new_folder
 from tools.sim.settings import SimMission
-from tools.sim.supervision import SupervisorError
 
 __all__ = ["read_mission", "sim", "with_overrides"]
 
 HOME_SPACING_M = 6.0
 SENSORS = ("pixels", "boxes")
 SIMULATED = "sim"
+LINKS = ("udp", "udpout", "tcp", "serial")
 NO_ROUTE = "no multicast route; for real buses: ip route add 224.0.0.0/4 dev lo"
 
 
@@ -47,40 +50,49 @@ def sim(
 ) -> None:
     """Fly a simulated fleet from one command."""
     console = Console()
+    fallback = "" if lockstep or has_multicast_route() else NO_ROUTE
     with plain_errors():
         chosen = with_overrides(read_mission(mission), drones, animals, seed, duration)
-        plan = _plan(chosen, out, sensor, scene, autopilot, lockstep)
-    fallback = "" if lockstep or has_multicast_route() else NO_ROUTE
+        addresses = _addresses(autopilot, chosen, "--lockstep" if lockstep else fallback)
+        plan = _plan(chosen, out, sensor, scene, addresses)
     if fallback:
         console.print(f"Flying in lockstep: {fallback}", highlight=False)
     console.print(
-        f"[bold]{chosen.name}[/]: {len(chosen.drones)} drones, {chosen.pod.animals} animals, seed {chosen.seed}"
-        f" -> {plan.folder}",
+        f"[bold]{escape(chosen.name)}[/]: {_counted(len(chosen.drones), 'drone')}, "
+        f"{_counted(chosen.pod.animals, 'animal')}, seed {chosen.seed} -> {plan.folder}",
         highlight=False,
     )
     with plain_errors():
         try:
             _fly(plan, console, headless=headless, lockstep=lockstep or bool(fallback), fallback=fallback)
+            stopped = False
         except KeyboardInterrupt:
+            stopped = True
+        if stopped and not (plan.folder / "truth.json").exists():
+            typer.echo(f"Stopped before anything flew; nothing to judge in {plan.folder}", err=True)
+            raise typer.Exit(INTERRUPTED)
+        if stopped:
             console.print("Stopped before its end; what was logged is judged.")
-        except SupervisorError as error:
-            typer.echo(f"podwatch: {error}", err=True)
-            raise typer.Exit(FAILED) from None
         summary = finish(plan.folder)
-    from tools.summary import print_summary  # noqa: PLC0415 - needs the summary's types only here
+    from tools.summary import print_summary
 
     print_summary(summary, console)
     console.print(f"Report: {plan.folder / 'report.html'}", highlight=False, soft_wrap=True)
+    if stopped:
+        raise typer.Exit(INTERRUPTED)
 
 
 def read_mission(name: str) -> SimMission:
     """A mission by path, or by the name of one that ships. Raises MissionError."""
     path = Path(name)
-    if not path.exists() and not name.endswith(".toml"):
+    if not path.is_file() and not name.endswith(".toml"):
         try:
             path = fleets.path(name)
         except FileNotFoundError as error:
-            raise MissionError(f"{error}; or give the path of a mission file") from error
+            there = sorted(file.stem for file in fleets.path("default").parent.glob("*.toml"))
+            near = difflib.get_close_matches(name, there, n=1)
+            guess = f"did you mean {near[0]!r}? " if near else ""
+            raise MissionError(f"{guess}{error}; or give the path of a mission file") from error
     return load_mission(path, SimMission)
 
 
@@ -106,26 +118,62 @@ def with_overrides(
 
 
 def _plan(
-    mission: SimMission, out: Path, sensor: str, scene: Path | None, autopilot: str, lockstep: bool
+    mission: SimMission, out: Path, sensor: str, scene: Path | None, addresses: tuple[str, ...]
 ) -> RunPlan:
+    """Look at everything that was given, and only then make the run's folder."""
     if sensor not in SENSORS:
         raise MissionError(f"--sensor {sensor}: there are {' and '.join(SENSORS)}")
-    addresses: tuple[str, ...] = ()
-    if autopilot != SIMULATED:
-        addresses = tuple(autopilot.split(","))
-        if len(addresses) != len(mission.drones):
-            raise MissionError(
-                f"--autopilot names {len(addresses)} addresses for {len(mission.drones)} drones; give one each"
-            )
-        if lockstep:
-            raise MissionError(
-                "--lockstep runs on a virtual clock, which a real autopilot cannot follow; drop one"
-            )
     if scene is not None:
-        if not scene.exists():
-            raise MissionError(f"--scene {scene}: no such file; give a photograph or a video")
+        if sensor == "boxes":
+            raise MissionError(f"--scene {scene}: --sensor boxes looks at no pixels; drop one of them")
         scene = scene.resolve()
-    return RunPlan(mission, new_folder(out.resolve()), sensor, scene, addresses)
+        open_surface(scene, mission.world.scene_width_m)
+        try:
+            RunPlan(mission, out, sensor, scene).scene_truth()
+        except ValueError as error:
+            raise MissionError(
+                f"--scene {scene}: the labels beside it are no YOLO text ({error}); each line is: class u v "
+                "width height, as shares of the picture"
+            ) from error
+    try:
+        folder = new_folder(out.resolve())
+    except OSError as error:
+        raise MissionError(
+            f"--out {out}: no folder can be made there ({error.strerror}); give one that you may write to"
+        ) from error
+    return RunPlan(mission, folder, sensor, scene, addresses)
+
+
+def _addresses(autopilot: str, mission: SimMission, lockstep: str) -> tuple[str, ...]:
+    """The real autopilots' addresses, by rank of their drones; none for simulated ones.
+
+    lockstep: why the run flies on a virtual clock, empty where it does not. host:port alone means udp.
+    """
+    if autopilot == SIMULATED:
+        return ()
+    addresses = [address.strip() for address in autopilot.split(",")]
+    if len(addresses) != len(mission.drones):
+        raise MissionError(
+            f"--autopilot names {_counted(len(addresses), 'address', 'addresses')} for "
+            f"{_counted(len(mission.drones), 'drone')}; give one each, with commas between"
+        )
+    named = tuple(a if a.split(":")[0] in LINKS else f"udp:{a}" for a in addresses)
+    for address in named:
+        if not address.rpartition(":")[2].isdigit() or address.count(":") < 2:
+            raise MissionError(
+                f"--autopilot {address.removeprefix('udp:')!r}: write 'sim', HOST:PORT, udp:HOST:PORT (listen), "
+                "udpout:HOST:PORT (send first), tcp:HOST:PORT or serial:DEVICE:BAUD"
+            )
+    if lockstep:
+        raise MissionError(
+            f"--autopilot: a real autopilot cannot follow the virtual clock of lockstep ({lockstep})"
+        )
+    return named
+
+
+def _counted(count: int, one: str, many: str = "") -> str:
+    """ "1 drone", "3 drones"."""
+    return f"{count} {one if count == 1 else many or one + 's'}"
 
 
 def _fly(plan: RunPlan, console: Console, *, headless: bool, lockstep: bool, fallback: str) -> None:

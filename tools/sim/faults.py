@@ -1,4 +1,6 @@
-"""Faults of a scenario: each begins some seconds after the fleet reaches a stage, and is done to the world, never to a process's memory."""
+"""Faults of a scenario: each begins some seconds after the fleet reaches a stage, and is done to the world,
+never to a process's memory.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field

@@ -1,4 +1,6 @@
-"""A whole fleet in one operating-system process on a virtual clock: the same shells and cores, the same bytes for the same seed."""
+"""A whole fleet in one operating-system process on a virtual clock: the same shells and cores, the same bytes
+for the same seed.
+"""
 
 import importlib
 from collections.abc import Callable
@@ -34,7 +36,7 @@ Observer = Callable[[int, str, bytes], None]
 
 
 class LockstepFleet:
-    """All drones of a plan, ready to run; `observe(drone_id, channel, data)` sees every message of every bus."""
+    """All drones of a plan, ready to run; `observe(drone_id, channel, data)` sees every message."""
 
     def __init__(self, plan: RunPlan, observe: Observer) -> None:
         cv2.setNumThreads(1)

@@ -7,6 +7,7 @@ import numpy as np
 
 from drivers.cameras.pinhole import Pinhole
 from drivers.sim.world import WorldSettings
+from lcmtypes.podwatch import world_animal_t
 from procs.history import camera_of
 from procs.queue_executor import ClockError
 from tools.sim.settings import SimMission
@@ -19,7 +20,9 @@ MODES = ("processes", "lockstep")
 
 @dataclass(frozen=True)
 class RunPlan:
-    """One simulated run before it flies. `scene` is a picture's or video's path, None for the rendered surface."""
+    """One simulated run before it flies. `scene` is a picture's or video's path, None for the rendered
+    surface.
+    """
 
     mission: SimMission
     folder: Path
@@ -74,7 +77,7 @@ class RunPlan:
             "centre_ne": self.centre_ne,
         }
 
-    def scene_truth(self) -> object:
+    def scene_truth(self) -> list[world_animal_t] | None:
         """Labelled animals of the picture, None where it has no labels or none is flown over."""
         if self.scene is None:
             return None

@@ -1,4 +1,6 @@
-"""A fleet as operating-system processes under supervisord: real multicast buses, real MAVLink over UDP, real radios on loopback."""
+"""A fleet as operating-system processes under supervisord: real multicast buses, real MAVLink over UDP, real
+radios on loopback.
+"""
 
 import json
 import secrets
@@ -37,7 +39,8 @@ class ProcessFleet:
         self.plan = plan
         self._watch = watch
         self._slot = Slot()
-        # Named by the slot, which nobody else holds now: what an earlier run there left behind is known as such.
+        # Named by the slot, which nobody else holds now: what an earlier run there left behind is known as
+        # such.
         prefix = f"podwatch_s{self._slot.number}x"
         _remove(prefix)
         self._run = f"s{self._slot.number}x{secrets.token_hex(4)}"

@@ -11,7 +11,7 @@ from tools.sim.plan import RunPlan
 from tools.sim.processes import ProcessFleet
 from tools.sim.watch import Screen, Watch
 
-__all__ = ["finish", "fly_lockstep", "fly_processes", "new_folder", "write_truth_notes"]
+__all__ = ["finish", "fly_lockstep", "fly_processes", "new_folder", "prepare", "write_truth_notes"]
 
 STEP_S = 0.25
 
@@ -29,11 +29,16 @@ def new_folder(parent: Path) -> Path:
     raise FileExistsError(f"{parent / stamp}: a thousand runs began in this second")
 
 
-def fly_lockstep(plan: RunPlan, screen: Screen | None, fallback_reason: str = "") -> None:
-    """Fly a plan on the virtual clock and write its notes."""
+def prepare(plan: RunPlan) -> None:
+    """What a run needs before it flies: the fleet's key, a new one unless the mission names one that exists."""
     key = plan.folder / plan.mission.radio.key_file
     if not key.exists():
         make_key(key)
+
+
+def fly_lockstep(plan: RunPlan, screen: Screen | None, fallback_reason: str = "") -> None:
+    """Fly a plan on the virtual clock and write its notes."""
+    prepare(plan)
     watch = Watch(plan.mission, screen)
     began = time.monotonic()
     fleet = LockstepFleet(plan, watch.hear)
@@ -43,25 +48,26 @@ def fly_lockstep(plan: RunPlan, screen: Screen | None, fallback_reason: str = ""
             fleet.run_until(fleet.now_s + STEP_S)
             wall_s = time.monotonic() - began
             over = watch.step(fleet.now_s, fleet, fleet.now_s / max(wall_s, 1e-6))
-    finally:
+    finally:  # a run that was stopped is judged by what it logged
         fleet.close()
-    write_truth_notes(plan, watch, "lockstep", fallback_reason, fleet.now_s, time.monotonic() - began)
+        write_truth_notes(plan, watch, "lockstep", fallback_reason, fleet.now_s, time.monotonic() - began)
 
 
 def fly_processes(plan: RunPlan, screen: Screen | None) -> None:
     """Fly a plan as operating-system processes and write its notes. Raises SupervisorError."""
-    make_key(plan.folder / plan.mission.radio.key_file)
+    prepare(plan)
     watch = Watch(plan.mission, screen)
     with ProcessFleet(plan, watch) as fleet:
         fleet.wait_until_ready()
         began = time.monotonic()
-        over = False
-        while not over:
-            fleet.look()
-            wall_s = time.monotonic() - began
-            over = watch.step(fleet.now_s, fleet, fleet.now_s / max(wall_s, 1e-6))
-        flown_s, wall_s = fleet.now_s, time.monotonic() - began
-    write_truth_notes(plan, watch, "processes", "", flown_s, wall_s)
+        try:
+            over = False
+            while not over:
+                fleet.look()
+                wall_s = time.monotonic() - began
+                over = watch.step(fleet.now_s, fleet, fleet.now_s / max(wall_s, 1e-6))
+        finally:  # a run that was stopped is judged by what it logged
+            write_truth_notes(plan, watch, "processes", "", fleet.now_s, time.monotonic() - began)
 
 
 def write_truth_notes(
@@ -97,8 +103,8 @@ def write_truth_notes(
 
 def finish(folder: Path) -> dict[str, object]:
     """summary.json and report.html of a run -> the summary."""
-    from tools.report import make_report  # noqa: PLC0415 - the report's libraries are slow to import
-    from tools.summary import write_summary  # noqa: PLC0415
+    from tools.report import make_report
+    from tools.summary import write_summary
 
     summary = write_summary(folder)
     make_report(folder)

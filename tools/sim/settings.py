@@ -1,4 +1,6 @@
-"""What a simulated mission's file may say beyond the mission itself: the world, its faults, and what is expected."""
+"""What a simulated mission's file may say beyond the mission itself: the world, its faults, and what is
+expected.
+"""
 
 from typing import Literal, Self
 

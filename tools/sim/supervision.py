@@ -25,7 +25,7 @@ ONE_THREAD = "OMP_NUM_THREADS=1,OPENBLAS_NUM_THREADS=1,MKL_NUM_THREADS=1"
 
 
 class SupervisorError(Exception):
-    """The process tree cannot start or has fallen; the message says which process, why, and where it wrote."""
+    """The process tree cannot start or fell; the message says which process, why, and where it wrote."""
 
 
 def program(drone_id: int, process: str) -> str:

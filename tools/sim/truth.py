@@ -49,7 +49,9 @@ class TruthWriter:
 def labelled_animals(
     scene: Path, width_m: float, centre_ne: tuple[float, float]
 ) -> list[world_animal_t] | None:
-    """The animals of a picture's YOLO labels (same name, .txt, beside it or in ../labels); None without such a file."""
+    """The animals of a picture's YOLO labels (same name, .txt, beside it or in ../labels); None without such
+    a file.
+    """
     places = (scene.with_suffix(".txt"), scene.parent.parent / "labels" / f"{scene.stem}.txt")
     labels = next((place for place in places if place.exists()), None)
     image = cv2.imread(str(scene)) if labels else None

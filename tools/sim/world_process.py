@@ -1,7 +1,9 @@
-"""The world of a run in processes mode: `python -m tools.sim.world_process PLAN.json`, under the run's supervisor.
+"""The world of a run in processes mode: `python -m tools.sim.world_process PLAN.json`, under the run's
+supervisor.
 
-Owns the simulation clock, the true state, the simulated autopilots (real MAVLink over UDP), the air between the radios and the truth's
-files. It hears commands (faults) on its own group. When processes tell that they are late it slows the clock.
+Owns the simulation clock, the true state, the simulated autopilots (real MAVLink over UDP), the air between
+the radios and the truth's files. It hears commands (faults) on its own group. When processes tell that they
+are late it slows the clock.
 """
 
 import argparse
@@ -73,7 +75,7 @@ class WorldProcess:
             now_us, _ = self._clock.read()
             wait_s = (self._world.now_us + STEP_US - now_us) / 1e6 / self._rate if self._rate else 0.1
             wait_s = max(wait_s, 0.0)
-            sockets = [self._lcm, *self._ether.sockets.values()]
+            sockets: list[Any] = [self._lcm, *self._ether.sockets.values()]
             select.select(sockets, [], [], min(wait_s, 0.1))
             while self._lcm.handle_timeout(0) > 0:
                 pass
@@ -121,7 +123,8 @@ class WorldProcess:
         elif command["kind"] == "kill":
             self._world.kill(command["drone"])
         elif command["kind"] == "cut":
-            self._ether.cut(*command["between"], command["on"])
+            first, second = command["between"]
+            self._ether.cut(first, second, command["on"])
 
     def _stop(self, _number: int, _frame: object) -> None:
         self._running = False
