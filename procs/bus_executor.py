@@ -31,7 +31,8 @@ DEFAULT_CLOCK = DriverSpec(driver="drivers.clocks.monotonic:MonotonicClock")
 def load_driver(spec: DriverSpec) -> Any:
     """The driver that `spec` names, made with its options. Raises RuntimeFailure naming what is wrong.
 
-    A driver is any class that the settings name, so any error of its making is the settings' or the machine's.
+    A driver is any class that the settings name: whatever goes wrong in its making is the settings' fault or
+    the machine's.
     """
     module, _, name = spec.driver.partition(":")
     try:

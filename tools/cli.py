@@ -1,13 +1,17 @@
 """The command line: `podwatch COMMAND`. Heavy imports wait until their command is called."""
 
+import os
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from tools import log
-from tools.errors import plain_errors
+from tools.errors import MISSING, plain_errors
 from tools.sim.command import sim
+
+# What a video reader cannot open, we tell in words of our own.
+os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 
 app = typer.Typer(
     help="A fleet of small drones that finds a pod of whales, agrees which is which, and keeps each in view.",
@@ -59,7 +63,8 @@ def render(
     """Render labelled scenes for training and validation."""
     from tools.render import command
 
-    command(out, n, seed, split, width, height)
+    with plain_errors():
+        command(out, n, seed, split, width, height)
 
 
 @train.command("detector")
@@ -81,8 +86,9 @@ def train_detector(
         typer.echo(
             f"podwatch: {error.name} is missing; install the extra: pip install 'podwatch[train]'", err=True
         )
-        raise typer.Exit(3) from None
-    command(out, data, Settings.steps if steps is None else steps, seed, smoke)
+        raise typer.Exit(MISSING) from None
+    with plain_errors():
+        command(out, data, Settings.steps if steps is None else steps, seed, smoke)
 
 
 @bench.command("fleet")

@@ -34,8 +34,8 @@ EXIT_CODES = {
 def plain_errors() -> Iterator[None]:
     """Turn the errors that a user can cause or mend into one line and an exit code.
 
-    An OSError that nobody foresaw (a full disk, a file that vanished) is told with its file; what is left is a
-    fault of ours and keeps its traceback.
+    An OSError that nobody foresaw (a full disk, a file that vanished) is told with its file; what is left is
+    a fault of ours and keeps its traceback.
     """
     try:
         yield

@@ -161,8 +161,8 @@ def _addresses(autopilot: str, mission: SimMission, lockstep: str) -> tuple[str,
     for address in named:
         if not address.rpartition(":")[2].isdigit() or address.count(":") < 2:
             raise MissionError(
-                f"--autopilot {address.removeprefix('udp:')!r}: write 'sim', HOST:PORT, udp:HOST:PORT (listen), "
-                "udpout:HOST:PORT (send first), tcp:HOST:PORT or serial:DEVICE:BAUD"
+                f"--autopilot {address.removeprefix('udp:')!r}: write 'sim', HOST:PORT, udp:HOST:PORT "
+                "(listen), udpout:HOST:PORT (send first), tcp:HOST:PORT or serial:DEVICE:BAUD"
             )
     if lockstep:
         raise MissionError(

@@ -30,7 +30,9 @@ def new_folder(parent: Path) -> Path:
 
 
 def prepare(plan: RunPlan) -> None:
-    """What a run needs before it flies: the fleet's key, a new one unless the mission names one that exists."""
+    """What a run needs before it flies: the fleet's key, a new one unless the mission names one that is
+    there.
+    """
     key = plan.folder / plan.mission.radio.key_file
     if not key.exists():
         make_key(key)
