@@ -145,6 +145,12 @@ class Situation:
         return vehicle is not None and self.seconds_since(vehicle.utime) <= VEHICLE_LIMIT_S
 
     @property
+    def link_ok(self) -> bool:
+        """The bridge hears the autopilot: before that it knows nothing of the vehicle, and says armed False."""
+        vehicle = self.inputs.vehicle
+        return vehicle is not None and vehicle.link_age_ms <= LINK_LIMIT_S * 1e3
+
+    @property
     def vehicle_ok(self) -> bool:
         """The vehicle's state is fresh, its link alive and its position good: it may be flown on
         setpoints.
@@ -154,7 +160,7 @@ class Situation:
             vehicle is not None
             and self.vehicle_fresh
             and vehicle.position_ok
-            and vehicle.link_age_ms <= LINK_LIMIT_S * 1e3
+            and self.link_ok
             and bool(np.isfinite([vehicle.n_m, vehicle.e_m, vehicle.d_m]).all())
         )
 

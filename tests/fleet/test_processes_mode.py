@@ -36,6 +36,8 @@ from tools.sim.run import fly_lockstep, write_truth_notes
 from tools.sim.settings import SimMission
 from tools.sim.watch import Watch
 
+pytestmark = pytest.mark.timeout(600)
+
 VICTIM = 2
 # The eyes and the memory are killed on the way: dead within the watch, they would take from the judge what he
 # looks at.
@@ -43,7 +45,7 @@ KILLED_ON_THE_WAY = ("camera", "detector", "tracker", "logger", "registrar", "as
 KILLED_WHILE_WATCHING = ("navigator", "autopilot")
 RESPAWN_LIMIT_S = 45.0  # of a machine that does five other things; an idle one takes about 2
 GONE_LIMIT_S = 20.0
-FLIGHT_LIMIT_S = 210.0
+FLIGHT_LIMIT_S = 400.0  # about 150 where the machine keeps up
 RATE_TOLERANCE = 0.25
 
 
@@ -142,7 +144,6 @@ def is_alive(process: psutil.Process) -> bool:
         return False
 
 
-@pytest.mark.timeout(400)
 def test_every_process_of_a_drone_comes_back_from_kill_9(flight, record_property):
     record_property("respawn_s", flight.respawn_s)
     assert sorted(flight.respawn_s) == sorted(processes.BY_NAME)
@@ -199,7 +200,6 @@ def rates(plan: RunPlan, drone_id: int) -> dict[str, tuple[str, float]]:
     }
 
 
-@pytest.mark.timeout(400)
 def test_both_modes_leave_the_same_channels_at_the_same_rates(flight, near, tmp_path):
     plan = new_plan(near, tmp_path / "run")
     fly_lockstep(plan, None)
