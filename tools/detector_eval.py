@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,12 +10,13 @@ from numpy.typing import NDArray
 from procs.detector.yolo import Detections, Detector
 from tools.detector_data import Sample
 
-__all__ = ["Score", "average_precision", "box_iou", "match", "score"]
+__all__ = ["Score", "average_precision", "box_iou", "match", "recall_by_length", "score"]
 
 Array = NDArray[np.float64]
 
 MATCH_IOU = 0.5
 FAINT_SHARE = 0.5  # a detection this far inside an animal too faint to count is no false alarm
+LENGTHS_PX = (0, 12, 24, 48, 96, 400)
 EVERY_SCORE = 0.01  # average precision needs the low scores too
 
 
@@ -77,6 +79,23 @@ def match(
         elif not extras_allowed and not np.any(inside[index] >= FAINT_SHARE):
             results.append((float(found.scores[index]), False))
     return results
+
+
+def recall_by_length(detector: Detector, samples: Iterable[Sample]) -> dict[str, tuple[int, int]]:
+    """(found, all) animals by the long side of their box, px of the detector's input, in LENGTHS_PX."""
+    counts = {f"{low}-{high} px": [0, 0] for low, high in pairwise(LENGTHS_PX)}
+    for sample in samples:
+        known = sample.boxes[sample.boxes[:, 4] > 0, :4]
+        overlap = box_iou(detector.detect(np.ascontiguousarray(sample.image)).boxes, known)
+        width, height = detector.input_size
+        scale = min(width / sample.image.shape[1], height / sample.image.shape[0])
+        long_px = (known[:, 2:] - known[:, :2]).max(axis=1, initial=0) * scale
+        for length_px, best in zip(long_px, overlap.max(axis=0, initial=0), strict=True):
+            place = int(np.clip(np.searchsorted(LENGTHS_PX, length_px, "right") - 1, 0, len(LENGTHS_PX) - 2))
+            count = list(counts.values())[place]
+            count[0] += bool(best >= MATCH_IOU)
+            count[1] += 1
+    return {key: (hits, total) for key, (hits, total) in counts.items()}
 
 
 def average_precision(results: list[tuple[float, bool]], animals: int) -> float:

@@ -31,7 +31,7 @@ from tools.detector_data import (
     read_yolo,
     scene_sample,
 )
-from tools.detector_eval import Score, score
+from tools.detector_eval import Score, recall_by_length, score
 from tools.detector_export import check_export, export
 from tools.detector_loss import detection_loss
 from tools.detector_model import WhaleDetector, cell_centres, decode
@@ -296,7 +296,11 @@ def _step(
 
 
 def evaluate(
-    model: Path | None = None, cache: Path = Path("runs/detector_cache"), scenes: int = 300, seed: int = 0
+    model: Path | None = None,
+    cache: Path = Path("runs/detector_cache"),
+    scenes: int = 300,
+    seed: int = 0,
+    confidence: float = 0.25,
 ) -> dict[str, Score]:
     """Measure a detector (None: the one that ships) on what it never saw, print the figures and return them.
 
@@ -305,8 +309,8 @@ def evaluate(
     """
     cv2.setNumThreads(1)
 
-    def detector(confidence: float) -> Detector:
-        return Detector(model, confidence=confidence)
+    def detector(least: float) -> Detector:
+        return Detector(model, confidence=least)
 
     results: dict[str, Score] = {}
     folder = real_data() / "right_whales"
@@ -314,7 +318,7 @@ def evaluate(
         _, kept = held_out(sorted((folder / "images").glob("*.jpg")))
         extras = frozenset(place for place, path in enumerate(kept) if path.stem in WITH_EXTRAS)
         results["photographs, held-out fifth"] = score(
-            detector, read_yolo(kept, folder / "labels"), extras_allowed=extras
+            detector, read_yolo(kept, folder / "labels"), confidence, extras
         )
     else:
         print(
@@ -326,9 +330,12 @@ def evaluate(
         ("val_sperm", "rendered, sperm whales"),
         ("empty", "rendered, no animal"),
     ):
-        results[name] = score(detector, cached_scenes(cache, scenes, seed, split, outlines))
+        results[name] = score(detector, cached_scenes(cache, scenes, seed, split, outlines), confidence)
     for name, result in results.items():
         print(f"{name}: {result.line()}", flush=True)
+    sperm = cached_scenes(cache, scenes, seed, "val_sperm", outlines)
+    for length, (hits, total) in recall_by_length(detector(confidence), sperm).items():
+        print(f"rendered, sperm whales of {length} in the input: recall {hits}/{total}", flush=True)
     return results
 
 

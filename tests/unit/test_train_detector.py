@@ -23,7 +23,7 @@ from tools.detector_data import (
     read_yolo,
     scene_sample,
 )
-from tools.detector_eval import average_precision, match, score
+from tools.detector_eval import average_precision, match, recall_by_length, score
 from tools.detector_loss import assign, detection_loss, pair_iou
 from tools.detector_model import WhaleDetector, cell_centres, decode
 from tools.render import measured_right_whales, render_dataset, scenes
@@ -292,3 +292,12 @@ def test_the_shipped_model_finds_real_whales_that_were_held_out() -> None:
     _, kept = held_out(sorted((folder / "images").glob("*.jpg")))
     result = score(lambda least: Detector(confidence=least), read_yolo(kept, folder / "labels"))
     assert result.average_precision >= 0.9
+
+
+def test_recall_is_counted_by_length_in_the_input() -> None:
+    scene = next(item for item in scenes(20, 900, "val_sperm", (320, 320)) if len(item.boxes) > 2)
+    boxes = np.column_stack([scene.boxes, np.ones(len(scene.boxes))]).astype(np.float32)
+    counts = recall_by_length(Detector(), [Sample(scene.image, boxes)])
+    assert sum(total for _, total in counts.values()) == len(boxes)
+    assert all(0 <= hits <= total for hits, total in counts.values())
+    assert next(iter(counts)) == "0-12 px"
