@@ -18,7 +18,6 @@ GONE_MISSES = 8  # frames in which an animal was not where it should be seen: it
 FORGET_S = 20.0  # an animal out of the picture for longer may be anywhere
 
 
-
 class PresenceGate:
     """Present when at least `share` of the last `frames` frames had detections; hysteresis on both edges.
 

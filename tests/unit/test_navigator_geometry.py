@@ -71,17 +71,47 @@ def test_single_false_detections_never_open_the_gate() -> None:
     assert not any(gate.update(k % 2 == 0) for k in range(200))
 
 
-def test_the_barycentre_follows_the_pod_and_keeps_a_diver_in_its_radius() -> None:
-    barycentre = Barycentre(gain=0.5)
-    barycentre.update(np.zeros((0, 2)))
+POD = np.array([[0.0, 0.0], [20.0, 0.0]])
+AROUND = np.array([[-30.0, -30.0], [50.0, -30.0], [50.0, 30.0], [-30.0, 30.0]])
+FRAME_US = 200_000
+
+
+def watched(frames: list[np.ndarray], view_ne: np.ndarray, first_us: int = 0) -> Barycentre:
+    """A barycentre that has taken the whole pod for four seconds, and then `frames`."""
+    barycentre = Barycentre()
+    for number, points in enumerate([POD] * 20 + frames):
+        view = AROUND if number < 20 else view_ne
+        barycentre.update(first_us + number * FRAME_US, points, view, margin_m=5.0)
+    return barycentre
+
+
+def test_the_barycentre_is_the_pods_middle_and_its_radius_reaches_half_a_body_further() -> None:
+    barycentre = Barycentre()
+    barycentre.update(0, np.zeros((0, 2)))
     assert barycentre.centre_ne is None
-    pod = np.array([[0.0, 0.0], [10.0, 0.0]])
-    for _ in range(20):
-        barycentre.update(pod, margin_m=5.0)
-    np.testing.assert_allclose(barycentre.centre_ne, [5, 0], atol=1e-3)
-    assert barycentre.radius_m == pytest.approx(10.0, abs=0.01)
-    barycentre.update(pod[:1], margin_m=5.0)
-    assert barycentre.radius_m > 9.0
+    barycentre = watched([], AROUND)
+    np.testing.assert_allclose(barycentre.centre_ne, [10, 0], atol=1e-6)
+    assert barycentre.radius_m == pytest.approx(15.0, abs=1e-6)
+
+
+def test_an_animal_that_slips_out_of_the_picture_still_counts_for_20_s() -> None:
+    half = np.array([[-30.0, -30.0], [10.0, -30.0], [10.0, 30.0], [-30.0, 30.0]])
+    barycentre = watched([POD[:1]] * 90, half)  # 18 s
+    np.testing.assert_allclose(barycentre.centre_ne, [10, 0], atol=1e-6)
+    barycentre = watched([POD[:1]] * 200, half)
+    np.testing.assert_allclose(barycentre.centre_ne, [0, 0], atol=1e-3)
+
+
+def test_an_animal_that_is_not_where_it_should_be_seen_is_soon_forgotten() -> None:
+    barycentre = watched([POD[:1]] * 40, AROUND)
+    np.testing.assert_allclose(barycentre.centre_ne, [0, 0], atol=0.1)
+    assert 5.0 <= barycentre.radius_m < 12.0, "the radius follows more slowly"
+
+
+def test_a_false_alarm_moves_neither_the_middle_nor_the_radius() -> None:
+    barycentre = watched([np.vstack([POD, [10.0, 25.0]])] + [POD] * 3, AROUND)
+    np.testing.assert_allclose(barycentre.centre_ne, [10, 0], atol=1e-6)
+    assert barycentre.radius_m == pytest.approx(15.0, abs=1e-6)
 
 
 @pytest.mark.parametrize("n", [2, 3, 5, 12])
