@@ -200,9 +200,15 @@ class DroneSettings(Section):
     def read(cls, path: Path) -> DroneSettings:
         """From a JSON file; MissionError says what is wrong with it."""
         try:
-            return cls.model_validate(json.loads(path.read_text()))
+            settings = cls.model_validate(json.loads(path.read_text()))
         except (OSError, ValueError) as error:
             raise MissionError(f"{path}: {error}") from error
+        if settings.drone_id not in settings.mission.roster:
+            roster = list(settings.mission.roster)
+            raise MissionError(
+                f"{path}: drone {settings.drone_id} is not in the roster {roster}; add its [[drones]] entry"
+            )
+        return settings
 
 
 S = TypeVar("S", bound=Mission)
