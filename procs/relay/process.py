@@ -101,6 +101,7 @@ class RelayShell:
             "refused",
             ", ".join(f"{n} {reason.value}" for reason, n in news.items() if n),
             "refused datagrams",
+            "; if a drone is missing, does it hold this fleet's key and this version?",
         )
         self._tell(
             "silent",
@@ -110,9 +111,9 @@ class RelayShell:
         lost = self._core.members.lost(now_us)
         self._tell("lost", ", ".join(str(member) for member in lost), "lost drones")
 
-    def _tell(self, cause: str, what: str, intro: str) -> None:
+    def _tell(self, cause: str, what: str, intro: str, remedy: str = "") -> None:
         if what:
-            self._runtime.degraded(f"{intro}: {what}", cause)
+            self._runtime.degraded(f"{intro}: {what}{remedy}", cause)
         else:
             self._runtime.ok(cause)
 

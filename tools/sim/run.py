@@ -5,7 +5,7 @@ import time
 from datetime import UTC, datetime
 from pathlib import Path
 
-from procs.relay.keys import make_key
+from procs.relay.keys import make_key, read_key
 from tools.sim.lockstep import LockstepFleet
 from tools.sim.plan import RunPlan
 from tools.sim.processes import ProcessFleet
@@ -31,10 +31,12 @@ def new_folder(parent: Path) -> Path:
 
 def prepare(plan: RunPlan) -> None:
     """What a run needs before it flies: the fleet's key, a new one unless the mission names one that is
-    there.
+    there. Raises FleetKeyError.
     """
     key = plan.folder / plan.mission.radio.key_file
-    if not key.exists():
+    if key.exists():
+        read_key(key)
+    else:
         make_key(key)
 
 
