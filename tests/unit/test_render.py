@@ -110,7 +110,7 @@ def test_a_tilted_camera_sees_haze_above_the_horizon(sea: SeaRenderer) -> None:
 
 
 def test_a_camera_under_water_is_refused(sea: SeaRenderer) -> None:
-    with pytest.raises(ValueError, match="above the surface"):
+    with pytest.raises(ValueError, match=r"height -2\.00 m"):
         sea.render(CAMERA, Pose(0.0, 0.0, 2.0), 0.0)
 
 

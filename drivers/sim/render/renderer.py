@@ -24,6 +24,7 @@ __all__ = ["WATERS", "SeaRenderer"]
 Array = NDArray[np.float64]
 
 INDIVIDUALS = 4  # differently marked pictures of a species; an animal's id picks one
+HALF_TO_FULL = np.array([[2.0, 0, 0.5], [0, 2.0, 0.5], [0, 0, 1.0]])  # centres of a half-size image's pixels
 HAZE_BGR = (198, 190, 180)  # where the camera looks above the horizon
 
 # BGR of the water under an overcast sky, picked from aerial photographs by eye: troughs are darker, crests
@@ -106,8 +107,11 @@ class SeaRenderer:
         if out is not None and (out.shape != (height, width, 3) or out.dtype != np.uint8):
             raise ValueError(f"out is {out.dtype} {out.shape}; the camera needs uint8 {(height, width, 3)}")
         to_ground = camera.image_to_ground(pose)
-        first, second = (self._warp(layer, to_ground, t_s, camera.image_size) for layer in self._layers)
-        brightness = cv2.add(first, second)
+        brightness = self._warp(self._layers[0], to_ground, t_s, (width, height))
+        # The cross waves at half the resolution: a third of the time, unseen under the sharp ones.
+        half_size = ((width + 1) // 2, (height + 1) // 2)
+        cross = self._warp(self._layers[1], to_ground @ HALF_TO_FULL, t_s, half_size)
+        cv2.add(brightness, cv2.resize(cross, (width, height)), dst=brightness)
         if self._glint > 0:
             cv2.add(brightness, self._glint_image(camera, to_ground, pose), dst=brightness)
         image = np.asarray(cv2.applyColorMap(brightness, self._table), np.uint8)

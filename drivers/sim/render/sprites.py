@@ -108,10 +108,10 @@ def _skin(species: Species, rng: np.random.Generator, bend: float) -> FloatImage
     station, side = _body_grid()
     side = side - bend * np.clip(station - 0.3, 0, None) ** 2
     half = np.interp(station, STATIONS, species.widths).astype(np.float32) / 2 + 1e-3
-    across = np.clip(np.abs(side) / half, 0, 1.5)
+    across = np.clip(np.abs(side) / half, 0, 1.2)
     tone = 0.8 + 0.4 * rng.random()
     # Light falls from above: bright along the spine, dark on the flanks; one side is lit more than the other.
-    light = 1.16 - 0.5 * across**2 + rng.uniform(-0.22, 0.22) * side / half
+    light = 1.16 - 0.5 * across**2 + rng.uniform(-0.22, 0.22) * np.clip(side / half, -1, 1)
     light += 0.10 * _noise(rng, 24, 10) + 0.05 * _noise(rng, 5, 5)
     wrinkled = species.wrinkles * np.clip((station - 0.32) * 12, 0, 1)
     light += 0.13 * wrinkled * _noise(rng, 34, 3)
