@@ -17,6 +17,7 @@ from procs.registrar.carry import BoxCarrier, Sighting
 from procs.registrar.episodes import EpisodeBook, Proposal
 from procs.registrar.map import Memory
 from procs.registrar.ring import NodeResult, RingNode, ViewGeometry
+from procs.registrar.steady import steady
 from procs.registrar.upkeep import Correction, MapBook, MapEntry
 
 __all__ = ["UPKEEP", "Finished", "Registrar", "RingPacket"]
@@ -198,7 +199,9 @@ class Registrar:
         """Make this drone's node for one instant from the frame nearest to it; no frame is an empty view."""
         look = running.looks[instant]
         t_utime = look.t_utime + clock_us
-        look.sighting = self.carrier.nearest(t_utime, NEAREST_FRAME_US)
+        seen = self.carrier.nearest(t_utime, NEAREST_FRAME_US)
+        if seen is not None:
+            look.sighting = steady(self.carrier.sightings, seen, self._whole(seen.boxes))
         boxes = look.sighting.boxes if look.sighting else np.zeros((0, 4))
         pose = pose_at(look.sighting.utime if look.sighting else t_utime)
         view = None

@@ -14,9 +14,10 @@ from procs.settings import DroneEntry, MissionError, load_mission, validate
 from tools.errors import INTERRUPTED, plain_errors
 from tools.live import LiveView
 from tools.sim.buses import has_multicast_route
+from tools.sim.expect import check, read_safety
 from tools.sim.plan import RunPlan
 from tools.sim.run import finish, fly_lockstep, fly_processes, new_folder
-from tools.sim.settings import SimMission
+from tools.sim.settings import Expect, SimMission
 
 __all__ = ["read_mission", "sim", "with_overrides"]
 
@@ -77,9 +78,23 @@ def sim(
     from tools.summary import print_summary
 
     print_summary(summary, console)
+    if (drones, animals, duration, scene) == (None, None, None, None):  # else the file's figures do not fit
+        _print_expected(chosen, plan.folder, summary, console)
     console.print(f"Report: {plan.folder / 'report.html'}", highlight=False, soft_wrap=True)
     if stopped:
         raise typer.Exit(INTERRUPTED)
+
+
+def _print_expected(mission: SimMission, folder: Path, summary: dict[str, Any], console: Console) -> None:
+    """Say whether the run did what its scenario's [expect] asks; nothing for a mission without one."""
+    if mission.expect == Expect():
+        return
+    safety = read_safety(folder, mission.limits)
+    short = check(mission.expect, summary, safety)
+    verdict = "fell short of what its file expects" if short else "did all that its file expects"
+    console.print(f"  The flight {verdict}; {safety}.", style="red" if short else "green", highlight=False)
+    for line in short:
+        console.print(f" - {line}", highlight=False, markup=False)
 
 
 def read_mission(name: str) -> SimMission:

@@ -81,6 +81,7 @@ class Expect(Section):
     min_in_image_share: float | None = None
     max_seconds_to_monitor: float | None = None
     min_episodes: int | None = None
+    min_distance_m: float = 3.0  # in truth, between any two living drones in the air
 
 
 class SimMission(Mission):
