@@ -1,10 +1,10 @@
 """The autopilot bridge: setpoints to MAVLink, telemetry to VEHICLE_STATE.
 
-Hears SETPOINT (the newest only) and the autopilot's link. Says VEHICLE_STATE at 20 Hz, stamped with the
-arrival of the position it holds. A setpoint goes out the moment it is heard, is repeated at 20 Hz while it
-lives, and never outlives its expiry: then the vehicle stands still, and a second later brakes by itself.
-Without a link to the autopilot for 2 s the heartbeat says degraded, and VEHICLE_STATE says that the position
-is not ok.
+Hears SETPOINT (the newest only) and the autopilot's link. Says VEHICLE_STATE at 20 Hz, once the autopilot has
+told of itself, stamped with the arrival of the position it holds. A setpoint goes out the moment it is heard,
+is repeated at 20 Hz while it lives, and never outlives its expiry: then the vehicle stands still, and a
+second later brakes by itself. Without a link to the autopilot for 2 s the heartbeat says degraded, and
+VEHICLE_STATE says that the position is not ok.
 """
 
 from lcmtypes import channels, make
@@ -40,7 +40,9 @@ class Autopilot:
         """Write what is due and say where the vehicle is."""
         utime = self._runtime.utime
         self._link.write(self._bridge.step(utime))
-        self._runtime.publish(channels.VEHICLE_STATE, make(vehicle_state_t, **self._bridge.state(utime)))
+        # A bridge that starts in flight must not say "landed, battery empty" before it has asked.
+        if self._bridge.telemetry.is_known:
+            self._runtime.publish(channels.VEHICLE_STATE, make(vehicle_state_t, **self._bridge.state(utime)))
 
     def check(self) -> None:
         """Name in the heartbeat what is wrong."""

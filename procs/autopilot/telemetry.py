@@ -30,6 +30,8 @@ class Telemetry:
     def __init__(self, origin: OriginSettings) -> None:
         self._fleet_origin = origin
         self.heartbeat_utime: int | None = None
+        self.battery = 0.0
+        self.is_known = False  # heard enough to speak for the vehicle: armed, and what the battery holds
         self.text = ""  # the last warning that the autopilot sent, for people
         self.forget()
 
@@ -38,7 +40,6 @@ class Telemetry:
         self.mode = 0
         self.armed = False
         self.roll_rad = self.pitch_rad = self.yaw_rad = 0.0
-        self.battery = 0.0
         self.position_utime: int | None = None
         self._landed_state = mavlink.MAV_LANDED_STATE_UNDEFINED
         self._local: Vector = (0.0, 0.0, 0.0)
@@ -98,8 +99,10 @@ class Telemetry:
             self._landed_state = message.landed_state
         elif kind == "GPS_GLOBAL_ORIGIN":
             self._set_origin(message.latitude * 1e-7, message.longitude * 1e-7)
-        elif kind == "SYS_STATUS" and message.battery_remaining >= 0:
-            self.battery = message.battery_remaining / 100
+        elif kind == "SYS_STATUS":
+            self.is_known = self.heartbeat_utime is not None
+            if message.battery_remaining >= 0:
+                self.battery = message.battery_remaining / 100
         elif kind == "STATUSTEXT" and message.severity <= mavlink.MAV_SEVERITY_WARNING:
             text = message.text
             self.text = text if isinstance(text, str) else text.decode(errors="replace")

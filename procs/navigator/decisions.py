@@ -25,13 +25,14 @@ def overriding_events(now: Situation, memory: Memory) -> list[Event]:
     """
     operator = podwatch.operator_t
     vehicle, limits = now.inputs.vehicle, now.mission.limits
-    down = vehicle is not None and now.vehicle_fresh and vehicle.landed and not vehicle.armed
+    told = vehicle is not None and now.vehicle_fresh and now.link_ok
+    down = vehicle is not None and told and vehicle.landed and not vehicle.armed
     if down and memory.state in (State.RETURN, State.LAND, State.HOLD):
         return [Event.TOUCHED_DOWN]
     if pilot_has_it(now):
         return [Event.PILOT]  # the pilot's stick always wins: no order, no battery moves the drone
     events = []
-    if vehicle is not None and vehicle.battery < limits.battery_land:
+    if vehicle is not None and told and vehicle.battery < limits.battery_land:
         events.append(Event.BATTERY_EMPTY)
     if now.command == operator.LAND:
         events.append(Event.ORDER_LAND)

@@ -146,7 +146,7 @@ class Situation:
 
     @property
     def link_ok(self) -> bool:
-        """The bridge hears the autopilot: before that it knows nothing of the vehicle, and says armed False."""
+        """The bridge hears the autopilot: else what it says of the vehicle is old, or defaults."""
         vehicle = self.inputs.vehicle
         return vehicle is not None and vehicle.link_age_ms <= LINK_LIMIT_S * 1e3
 

@@ -2,10 +2,12 @@
 
 import pytest
 
+from drivers.autopilots.ardupilot import mavlink
 from lcmtypes import make, podwatch
+from procs.autopilot.telemetry import Telemetry
 from procs.navigator.mission import Inputs, Navigator
 from procs.navigator.states import State
-from procs.settings import Mission
+from procs.settings import Mission, OriginSettings
 
 S = 1_000_000
 NEVER_MS = 2**31 - 1
@@ -57,3 +59,28 @@ def test_on_the_ground_it_begins_only_with_an_autopilot(heard):
         outputs = navigator.update(Inputs(utime=utime, vehicle=on_ground))
     assert outputs is not None
     assert (outputs.mission is not None) == heard
+
+
+def test_a_bridge_that_starts_anew_in_flight_says_nothing_of_the_vehicle_before_it_was_told():
+    """Its defaults are "landed, disarmed, battery empty": a drone that believed them would come down."""
+    telemetry = Telemetry(OriginSettings())
+    heartbeat = mavlink.MAVLink_heartbeat_message(2, 3, mavlink.MAV_MODE_FLAG_SAFETY_ARMED, 4, 4, 3)
+    telemetry.hear(heartbeat, 1 * S)
+    assert not telemetry.is_known
+    telemetry.hear(mavlink.MAVLink_sys_status_message(*[0] * 6, 80, *[0] * 6), 2 * S)
+    assert telemetry.is_known
+    assert (telemetry.armed, telemetry.landed, telemetry.battery) == (True, False, 0.8)
+    telemetry.hear(heartbeat, 60 * S)  # after a silence, as of a restart
+    assert telemetry.battery == 0.8, "it has not run empty meanwhile"
+
+
+def test_in_doubt_whether_the_autopilot_is_heard_no_drone_has_touched_down():
+    navigator = Navigator(Mission(), 2)
+    states: list[int] = []
+    for tick in range(80):
+        utime = 100 * S + tick * S // 10
+        outputs = navigator.update(Inputs(utime=utime, vehicle=vehicle(utime, heard=not 40 <= tick < 60)))
+        if outputs.mission is not None:
+            states.append(outputs.mission.state)
+    assert State.LANDED not in states
+    assert State.LAND not in states
