@@ -6,13 +6,15 @@ from typing import Protocol
 
 import numpy as np
 
+from drivers.cameras.pinhole import Pose
 from drivers.sim.autopilot import SimAutopilot
 from drivers.sim.pod import Pod, PodSettings
+from drivers.sim.routed_autopilot import RoutedAutopilot
 from drivers.sim.vehicle import Vehicle, Wind
 from lcmtypes import make
 from lcmtypes.podwatch import world_animal_t, world_drone_t, world_state_t
 
-__all__ = ["AutopilotLink", "World", "WorldSettings"]
+__all__ = ["Autopilot", "AutopilotLink", "Body", "World", "WorldSettings"]
 
 STEP_US = 20_000
 GUST_SHARE = 0.2  # standard deviation of gusts, of the mean wind
@@ -24,6 +26,24 @@ class AutopilotLink(Protocol):
     def write(self, data: bytes) -> None: ...
 
     def receive(self) -> bytes: ...
+
+
+class Autopilot(Protocol):
+    """What flies a drone: bytes of MAVLink in and out."""
+
+    def receive(self, data: bytes, t_s: float) -> None: ...
+
+    def step(self, t_s: float) -> bytes: ...
+
+
+class Body(Protocol):
+    """What is seen of a drone from outside."""
+
+    @property
+    def pose(self) -> Pose: ...
+
+    @property
+    def velocity_ned(self) -> tuple[float, float, float]: ...
 
 
 @dataclass(frozen=True)
@@ -42,13 +62,19 @@ class WorldSettings:
 class World:
     """Steps everything that exists by simulation time; knows nothing of who looks at it."""
 
-    def __init__(self, settings: WorldSettings, links: Mapping[int, AutopilotLink]) -> None:
+    def __init__(
+        self,
+        settings: WorldSettings,
+        links: Mapping[int, AutopilotLink],
+        routed: Mapping[int, RoutedAutopilot] | None = None,
+    ) -> None:
+        """`routed`: the drones that real autopilots fly; all others get simulated ones."""
         self.now_us = 0
         self._seq = 0
         self._links = dict(links)
         self.pod = Pod(settings.pod, np.random.default_rng([settings.seed, 1]))
-        self.vehicles: dict[int, Vehicle] = {}
-        self.autopilots: dict[int, SimAutopilot] = {}
+        self.vehicles: dict[int, Body] = {}
+        self.autopilots: dict[int, Autopilot] = {}
         self.dead: dict[int, float] = {}
         towards_rad = float(np.random.default_rng([settings.seed, 2]).uniform(-np.pi, np.pi))
         mean = (
@@ -56,15 +82,19 @@ class World:
             settings.wind_m_s * float(np.sin(towards_rad)),
         )
         for drone_id, home in settings.homes.items():
+            if routed and drone_id in routed:
+                self.vehicles[drone_id] = self.autopilots[drone_id] = routed[drone_id]
+                continue
             random = np.random.default_rng([settings.seed, 3, drone_id])
-            self.vehicles[drone_id] = Vehicle(
+            vehicle = Vehicle(
                 home,
                 random,
                 wind=Wind(mean_ne_m_s=mean, gust_m_s=GUST_SHARE * settings.wind_m_s),
                 yaw_rad=float(random.uniform(-np.pi, np.pi)),
             )
+            self.vehicles[drone_id] = vehicle
             self.autopilots[drone_id] = SimAutopilot(
-                self.vehicles[drone_id],
+                vehicle,
                 drone_id,
                 random,
                 origin=settings.origin,

@@ -147,6 +147,7 @@ class ProcessFleet:
             "mavlink_ports": self._mavlink_ports,
             "radio_ports": self._radio_ports,
             "ether_ports": self._ether_ports,
+            "autopilots": dict(zip(plan.mission.roster, plan.autopilots, strict=False)),
         }
 
     def _drone_settings(self, drone_id: int) -> DroneSettings:

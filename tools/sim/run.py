@@ -86,6 +86,7 @@ def write_truth_notes(
         "fallback_reason": fallback_reason or None,
         "sensor": plan.sensor,
         "scene": str(plan.scene.name) if plan.scene else None,
+        "autopilots": list(plan.autopilots),  # real ones: then truth is what they say of themselves
         "scene_truth": plan.scene is None or plan.scene_truth() is not None,
         "clocks": {
             str(drone_id): {"offset_us": clock.offset_us, "drift_ppm": clock.drift_ppm}

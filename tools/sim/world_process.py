@@ -3,7 +3,8 @@ supervisor.
 
 Owns the simulation clock, the true state, the simulated autopilots (real MAVLink over UDP), the air between
 the radios and the truth's files. It hears commands (faults) on its own group. When processes tell that they
-are late it slows the clock.
+are late it slows the clock. Where real autopilots fly (`--autopilot`) it carries their bytes,
+takes the vehicles' places from what they say, and never slows the clock: it warns instead.
 """
 
 import argparse
@@ -17,13 +18,14 @@ from typing import Any
 import lcm
 import numpy as np
 
-from drivers.autopilots.mavlink_link import MavlinkUdpClient
+from drivers.autopilots.mavlink_link import MavlinkUdpClient, open_link
 from drivers.sim.clock import ClockPage
 from drivers.sim.ether import UdpEther
 from drivers.sim.remote import world_url
+from drivers.sim.routed_autopilot import MisplacedError, RoutedAutopilot
 from drivers.sim.world import STEP_US, World
 from lcmtypes import channels
-from procs.main import end_with_parent
+from procs.main import EXIT_CANNOT_START, end_with_parent
 from tools.sim.plan import RunPlan
 from tools.sim.settings import SimMission
 from tools.sim.truth import TruthWriter
@@ -54,7 +56,18 @@ class WorldProcess:
             int(drone_id): MavlinkUdpClient(f"127.0.0.1:{port}", int(drone_id))
             for drone_id, port in settings["mavlink_ports"].items()
         }
-        self._world = World(plan.world_settings(), self._links)
+        world = plan.world_settings()
+        self._routed = {
+            int(drone_id): RoutedAutopilot(
+                open_link(address, int(drone_id)),
+                int(drone_id),
+                origin=world.origin,
+                home=world.homes[int(drone_id)],
+            )
+            for drone_id, address in settings["autopilots"].items()
+        }
+        self._told: dict[int, str] = {}
+        self._world = World(world, self._links, self._routed)
         self._ether = UdpEther(
             {int(drone_id): port for drone_id, port in settings["radio_ports"].items()},
             np.random.default_rng([mission.seed, 5]),
@@ -85,6 +98,8 @@ class WorldProcess:
             self._step(int(now_us))
         self._truth.close()
         self._ether.close()
+        for autopilot in self._routed.values():
+            autopilot.close()
 
     def _step(self, now_us: int) -> None:
         if now_us < self._world.now_us + STEP_US:
@@ -102,6 +117,9 @@ class WorldProcess:
     def _pace(self) -> None:
         """Slow the clock for everybody while anybody is late, and let it recover."""
         late_s = self._clock.take_late()
+        if self._routed:
+            self._warn(late_s)
+            return
         rate = self._rate
         if late_s > LATE_LIMIT_S:
             rate = max(rate * SLOWER, SLOWEST)
@@ -111,6 +129,21 @@ class WorldProcess:
             now_us, _ = self._clock.read()
             self._rate = rate
             self._clock.set(now_us, rate)
+
+    def _warn(self, late_s: float) -> None:
+        """A real autopilot's time cannot be slowed: say on stderr that this machine is too slow for it, and
+        what is wrong with the autopilots; each once until it is over.
+        """
+        now_s = self._world.now_us / 1e6
+        told = {drone_id: autopilot.problem(now_s) for drone_id, autopilot in self._routed.items()}
+        told[0] = "this machine is too slow for real time; fly fewer drones, or with --sensor boxes"
+        if late_s <= LATE_LIMIT_S:
+            told[0] = ""
+        for drone_id, text in told.items():
+            if text and not self._told.get(drone_id):
+                sys.stderr.write(f"world: at {now_s:.1f} s: {text}\n")
+                sys.stderr.flush()
+        self._told = told
 
     def _command(self, _channel: str, data: bytes) -> None:
         """A fault, as JSON, from the run's own tool."""
@@ -139,8 +172,12 @@ def main() -> None:
         world = WorldProcess(json.loads(arguments.settings.read_text()))
     except (OSError, ValueError, RuntimeError) as error:
         sys.stderr.write(f"world: {error}\n")
-        sys.exit(3)
-    world.run()
+        sys.exit(EXIT_CANNOT_START)
+    try:
+        world.run()
+    except MisplacedError as error:
+        sys.stderr.write(f"world: {error}\n")
+        sys.exit(EXIT_CANNOT_START)
 
 
 if __name__ == "__main__":
