@@ -299,10 +299,12 @@ def evaluate(
     model: Path | None = None,
     cache: Path = Path("runs/detector_cache"),
     scenes: int = 300,
-    seed: int = 0,
+    seed: int = 1,
     confidence: float = 0.25,
 ) -> dict[str, Score]:
     """Measure a detector (None: the one that ships) on what it never saw, print the figures and return them.
+
+    Seed 1: seed 0 showed, while the trainer was being set up, that boats and foam passed for whales.
 
     The held-out fifth of the photographs (left out where ../shared/data is missing), rendered scenes of
     species that the trainer never draws, of sperm whales in seas that it never draws, and empty seas.
