@@ -2,6 +2,7 @@
 by name.
 """
 
+import hashlib
 from itertools import pairwise
 from pathlib import Path
 
@@ -302,3 +303,8 @@ def test_the_shipped_model_is_small_and_says_what_it_is() -> None:
     metadata = {entry.key: entry.value for entry in onnx.load(str(path)).metadata_props}
     assert metadata["task"] == "detect"
     assert metadata["license"] == "Apache-2.0"
+
+
+def test_the_model_card_is_about_the_file_that_ships() -> None:
+    digest = hashlib.sha256(models.path("detector.onnx").read_bytes()).hexdigest()
+    assert digest in models.path("detector.md").read_text()
