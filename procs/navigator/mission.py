@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from drivers.cameras.pinhole import Pinhole
 from lcmtypes import make, podwatch
+from procs.history import camera_of
 from procs.navigator import behaviours, finds, resume
 from procs.navigator.decisions import overriding_events
 from procs.navigator.flight import limited
@@ -58,8 +59,7 @@ class Navigator:
         mission.home(drone_id)  # KeyError names a drone that the roster lacks
         self.mission = mission
         self.drone_id = drone_id
-        camera = mission.camera
-        self.camera = Pinhole((camera.width_px, camera.height_px), float(np.radians(camera.vfov_deg)))
+        self.camera = camera_of(mission.camera)
         self.memory = Memory(
             gate=PresenceGate(mission.search.presence_frames, mission.search.presence_share),
             barycentre=Barycentre(reach_m=0.6 * mission.watch.animal_length_m),
@@ -81,12 +81,7 @@ class Navigator:
         """Keep a pose for the frames to come; a shell may call it for every VEHICLE_STATE, `update` does for
         the newest.
         """
-        if vehicle.position_ok:
-            self.memory.poses.add(
-                vehicle.utime,
-                np.array([vehicle.n_m, vehicle.e_m, vehicle.d_m], dtype=np.float64),
-                np.array([vehicle.roll_rad, vehicle.pitch_rad, vehicle.yaw_rad], dtype=np.float64),
-            )
+        self.memory.poses.add(vehicle)
         if self.memory.yaw_rad is None:
             self.memory.yaw_rad = vehicle.yaw_rad
 

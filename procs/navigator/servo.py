@@ -4,15 +4,13 @@ The pixel is projected to the ground with the pose that the drone had when the f
 does not look like motion of the animal; an alpha-beta filter carries place and velocity over gaps.
 """
 
-from collections import deque
-
 import numpy as np
 from numpy.typing import NDArray
 
 from drivers.cameras.pinhole import Pinhole, Pose, apply_homography
 from procs.navigator.flight import approach
 
-__all__ = ["AnimalFilter", "PoseHistory", "ground_points", "servo_velocity"]
+__all__ = ["AnimalFilter", "ground_points", "servo_velocity"]
 
 Array = NDArray[np.float64]
 
@@ -20,39 +18,6 @@ MIN_HEIGHT_M = 2.0  # below it the ground is too near for a projection
 MAX_RANGE_HEIGHTS = (
     3.0  # a pixel that falls further away than this many heights is near the horizon: not believed
 )
-
-
-class PoseHistory:
-    """The drone's poses of the last seconds, so that a frame is projected with the pose of its own
-    instant.
-    """
-
-    def __init__(self, keep: int = 60) -> None:
-        self._times_us: deque[int] = deque(maxlen=keep)
-        self._poses: deque[Array] = deque(maxlen=keep)
-
-    def add(self, utime: int, ned: Array, roll_pitch_yaw: Array) -> None:
-        """Take a pose; one that is not newer than the newest is left out."""
-        if self._times_us and utime <= self._times_us[-1]:
-            return
-        self._times_us.append(utime)
-        self._poses.append(np.concatenate([ned, roll_pitch_yaw]))
-
-    def at(self, utime: int, max_gap_s: float = 0.5) -> Pose | None:
-        """The pose at `utime`, interpolated; None when no pose lies within `max_gap_s`."""
-        if not self._times_us:
-            return None
-        times = np.array(self._times_us, dtype=np.float64)
-        if np.abs(times - utime).min() > max_gap_s * 1e6:
-            return None
-        after = int(np.clip(np.searchsorted(times, utime), 1, len(times) - 1)) if len(times) > 1 else 0
-        if after == 0:
-            return Pose(*(float(value) for value in self._poses[0]))
-        share = float(np.clip((utime - times[after - 1]) / (times[after] - times[after - 1]), 0, 1))
-        before, later = self._poses[after - 1], self._poses[after]
-        step = later - before
-        step[3:] = (step[3:] + np.pi) % (2 * np.pi) - np.pi
-        return Pose(*(float(value) for value in before + share * step))
 
 
 def ground_points(camera: Pinhole, pose: Pose, pixels: Array) -> Array:

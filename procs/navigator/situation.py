@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lcmtypes import podwatch
+from procs.history import PoseHistory
 from procs.navigator.formation import layer_heights
 from procs.navigator.presence import Barycentre, PresenceGate
-from procs.navigator.servo import AnimalFilter, PoseHistory
+from procs.navigator.servo import AnimalFilter
 from procs.navigator.states import IN_CIRCLE, Event, State
 from procs.settings import Mission
 

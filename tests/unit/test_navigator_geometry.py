@@ -13,7 +13,7 @@ from drivers.cameras.pinhole import Pinhole, Pose, apply_homography
 from procs.navigator.flight import approach, inside_fence, limited
 from procs.navigator.formation import circle_radius, gather_height, layer_heights, separate, slot
 from procs.navigator.presence import Barycentre, PresenceGate
-from procs.navigator.servo import AnimalFilter, PoseHistory, ground_points, servo_velocity
+from procs.navigator.servo import AnimalFilter, ground_points, servo_velocity
 from procs.navigator.spiral import spacing_for, spiral
 from procs.settings import LimitSettings
 
@@ -240,19 +240,6 @@ def test_goals_are_moved_inside_the_fence(n_m: float, e_m: float, d_m: float) ->
     goal = inside_fence(np.array([n_m, e_m, d_m]), limits)
     assert np.hypot(goal[0], goal[1]) <= 97.0 + 1e-9
     assert limits.min_height_m <= -goal[2] <= limits.max_height_m
-
-
-def test_the_pose_at_a_frame_is_interpolated_across_north() -> None:
-    poses = PoseHistory()
-    assert poses.at(0) is None
-    poses.add(1_000_000, np.array([0.0, 0, -30]), np.array([0, 0, np.pi - 0.1]))
-    poses.add(1_200_000, np.array([2.0, 0, -30]), np.array([0, 0, -np.pi + 0.1]))
-    poses.add(1_100_000, np.array([99.0, 0, -30]), np.zeros(3))  # late: left out
-    middle = poses.at(1_100_000)
-    assert middle is not None
-    assert middle.n_m == pytest.approx(1.0)
-    assert abs(middle.yaw_rad) == pytest.approx(np.pi)
-    assert poses.at(3_000_000) is None
 
 
 @quick

@@ -30,6 +30,9 @@ START_LIMIT_S = 90.0
 CHECK_EVERY_S = 2.0
 LOOK_S = 0.1
 SHARED_FOLDER = Path("/dev/shm")
+MASK_TRACKER = "procs.tracker.mask_tracker:MaskTracker"
+
+Specs = dict[str, tuple[str, dict[str, Any]]]  # edge -> (driver, options)
 
 
 class ProcessFleet:
@@ -152,54 +155,7 @@ class ProcessFleet:
 
     def _drone_settings(self, drone_id: int) -> DroneSettings:
         mission = self.plan.mission
-        camera = mission.camera
-        clock = self.plan.clock(drone_id)
-        seed = mission.seed * 100 + drone_id
-        boxes = self.plan.sensor == "boxes"
-        specs: dict[str, tuple[str, dict[str, Any]]] = {
-            "clock": (
-                "drivers.sim.clock:SimClock",
-                {
-                    "page": str(self._page_path),
-                    "offset_us": clock.offset_us,
-                    "drift_ppm": clock.drift_ppm,
-                },
-            ),
-            "camera": (
-                "drivers.sim.remote:RemoteCamera",
-                {
-                    "drone_id": drone_id,
-                    "world_url": world_url(self._slot.number),
-                    "clock_page": str(self._page_path),
-                    "image_size": [camera.width_px, camera.height_px],
-                    "vfov_deg": camera.vfov_deg,
-                    "surface": self.plan.surface_options(),
-                    "poster": mission.pod.poster,
-                },
-            ),
-            "frames": ("drivers.frames:SharedFrames", {"run": self._run, "drone_id": drone_id}),
-            "detector": ("drivers.sim.boxes:BoxDetector", {"seed": seed})
-            if boxes
-            else ("procs.detector.yolo:Detector", {}),
-            "tracker": ("drivers.sim.boxes:BoxTracker", {"seed": seed})
-            if boxes
-            else ("procs.tracker.mask_tracker:MaskTracker", {}),
-            "autopilot": (
-                "drivers.autopilots.mavlink_link:MavlinkUdp",
-                {"listen": f"127.0.0.1:{self._mavlink_ports[drone_id]}", "system_id": drone_id},
-            ),
-            "radio": (
-                "drivers.radios.udp:UdpRadio",
-                {
-                    "bind": f"127.0.0.1:{self._radio_ports[drone_id]}",
-                    "peers": {
-                        str(peer): f"127.0.0.1:{self._ether_ports[peer]}"
-                        for peer in mission.roster
-                        if peer != drone_id
-                    },
-                },
-            ),
-        }
+        specs = {**self._edges(drone_id), **self._models(drone_id)}
         return DroneSettings(
             drone_id=drone_id,
             mission=mission,
@@ -211,6 +167,53 @@ class ProcessFleet:
                 name: DriverSpec(driver=driver, options=options) for name, (driver, options) in specs.items()
             },
         )
+
+    def _edges(self, drone_id: int) -> Specs:
+        """A drone's clock, camera, frames, autopilot link and radio in this run."""
+        mission, camera = self.plan.mission, self.plan.mission.camera
+        clock = self.plan.clock(drone_id)
+        page = str(self._page_path)
+        peers = [peer for peer in mission.roster if peer != drone_id]
+        return {
+            "clock": (
+                "drivers.sim.clock:SimClock",
+                {"page": page, "offset_us": clock.offset_us, "drift_ppm": clock.drift_ppm},
+            ),
+            "camera": (
+                "drivers.sim.remote:RemoteCamera",
+                {
+                    "drone_id": drone_id,
+                    "world_url": world_url(self._slot.number),
+                    "clock_page": page,
+                    "image_size": [camera.width_px, camera.height_px],
+                    "vfov_deg": camera.vfov_deg,
+                    "surface": self.plan.surface_options(),
+                    "poster": mission.pod.poster,
+                },
+            ),
+            "frames": ("drivers.frames:SharedFrames", {"run": self._run, "drone_id": drone_id}),
+            "autopilot": (
+                "drivers.autopilots.mavlink_link:MavlinkUdp",
+                {"listen": f"127.0.0.1:{self._mavlink_ports[drone_id]}", "system_id": drone_id},
+            ),
+            "radio": (
+                "drivers.radios.udp:UdpRadio",
+                {
+                    "bind": f"127.0.0.1:{self._radio_ports[drone_id]}",
+                    "peers": {str(peer): f"127.0.0.1:{self._ether_ports[peer]}" for peer in peers},
+                },
+            ),
+        }
+
+    def _models(self, drone_id: int) -> Specs:
+        """What looks at the pixels; their stand-ins with `--sensor boxes`."""
+        if self.plan.sensor != "boxes":
+            return {"detector": ("procs.detector.yolo:Detector", {}), "tracker": (MASK_TRACKER, {})}
+        seed = {"seed": self.plan.mission.seed * 100 + drone_id}
+        return {
+            "detector": ("drivers.sim.boxes:BoxDetector", seed),
+            "tracker": ("drivers.sim.boxes:BoxTracker", seed),
+        }
 
 
 def _remove(prefix: str) -> None:
