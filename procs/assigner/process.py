@@ -72,7 +72,9 @@ class AssignerShell:
             return
         self._key, self._members = key, members
         here = np.array([self._vehicle.n_m, self._vehicle.e_m])
-        animals = [one for one in message.map if one.id not in self._left]
+        # One that is only remembered, and that the views should have seen and did not, is nobody's to watch.
+        there = [one for one in message.map if one.hits > 0 or one.misses == 0]
+        animals = [one for one in there if one.id not in self._left]
         costs = [float(np.hypot(*(here - (one.n_m, one.e_m)))) for one in animals]
         held = {one.id for one in animals if one.age_ms <= PREVIOUS_WITHIN_MS}
         self._agent = Agent(

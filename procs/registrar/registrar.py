@@ -290,7 +290,8 @@ class Registrar:
             if pose is not None and result.has_pose:
                 turn = float(np.angle(np.exp(1j * (result.yaw_rad - pose.yaw_rad))))
                 self.correction = Correction(result.n_m - pose.n_m, result.e_m - pose.e_m, turn)
-        self.memory = result.memory
+        if self.finished is not None and self.finished.consensus:  # what was not agreed is not remembered
+            self.memory = result.memory
         mine = set(result.identities.tolist())
         self.map.replace(
             [
