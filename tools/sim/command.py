@@ -10,6 +10,7 @@ from rich.markup import escape
 
 import fleets
 from drivers.sim.render import open_surface
+from procs.runtime import RuntimeFailure
 from procs.settings import DroneEntry, MissionError, load_mission, validate
 from tools.errors import INTERRUPTED, plain_errors
 from tools.live import LiveView
@@ -40,7 +41,11 @@ def sim(
     ] = None,
     scene: Annotated[Path | None, typer.Option(help="A photograph or video as the world's surface.")] = None,
     autopilot: Annotated[
-        str, typer.Option(help="'sim', or a comma between addresses of real ones.")
+        str,
+        typer.Option(
+            help="'sim', or the address of a real one for each drone, with commas between: HOST:PORT or "
+            "udp:HOST:PORT to listen, udpout:HOST:PORT to send first, tcp:HOST:PORT, serial:DEVICE:BAUD."
+        ),
     ] = SIMULATED,
     sensor: Annotated[
         str, typer.Option(help="pixels, or boxes in place of pixels for large batches.")
@@ -54,7 +59,7 @@ def sim(
     fallback = "" if lockstep or has_multicast_route() else NO_ROUTE
     with plain_errors():
         chosen = with_overrides(read_mission(mission), drones, animals, seed, duration)
-        addresses = _addresses(autopilot, chosen, "--lockstep" if lockstep else fallback)
+        addresses = _addresses(autopilot, chosen, lockstep, fallback)
         plan = _plan(chosen, out, sensor, scene, addresses)
     if fallback:
         console.print(f"Flying in lockstep: {fallback}", highlight=False)
@@ -78,7 +83,8 @@ def sim(
     from tools.summary import print_summary
 
     print_summary(summary, console)
-    if (drones, animals, duration, scene) == (None, None, None, None):  # else the file's figures do not fit
+    # Where the run was changed or stopped, the file's figures do not fit.
+    if not stopped and (drones, animals, duration, scene) == (None, None, None, None):
         _print_expected(chosen, plan.folder, summary, console)
     console.print(f"Report: {plan.folder / 'report.html'}", highlight=False, soft_wrap=True)
     if stopped:
@@ -159,10 +165,11 @@ def _plan(
     return RunPlan(mission, folder, sensor, scene, addresses)
 
 
-def _addresses(autopilot: str, mission: SimMission, lockstep: str) -> tuple[str, ...]:
+def _addresses(autopilot: str, mission: SimMission, lockstep: bool, fallback: str) -> tuple[str, ...]:
     """The real autopilots' addresses, by rank of their drones; none for simulated ones.
 
-    lockstep: why the run flies on a virtual clock, empty where it does not. host:port alone means udp.
+    lockstep: whether it was asked for. fallback: why nothing else can fly here, empty where it can. host:port
+    alone means udp. Raises MissionError, and RuntimeFailure where the machine cannot.
     """
     if autopilot == SIMULATED:
         return ()
@@ -179,10 +186,11 @@ def _addresses(autopilot: str, mission: SimMission, lockstep: str) -> tuple[str,
                 f"--autopilot {address.removeprefix('udp:')!r}: write 'sim', HOST:PORT, udp:HOST:PORT "
                 "(listen), udpout:HOST:PORT (send first), tcp:HOST:PORT or serial:DEVICE:BAUD"
             )
+    told = "--autopilot: a real autopilot cannot follow the virtual clock of lockstep"
     if lockstep:
-        raise MissionError(
-            f"--autopilot: a real autopilot cannot follow the virtual clock of lockstep ({lockstep})"
-        )
+        raise MissionError(f"{told}; drop it, or --lockstep")
+    if fallback:
+        raise RuntimeFailure(f"{told}, and nothing else can fly here: {fallback}")
     return named
 
 
