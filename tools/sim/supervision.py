@@ -143,7 +143,8 @@ class Supervisor:
     def _rows(self) -> list[dict[str, Any]]:
         """supervisord's account of each program; empty while it does not answer."""
         try:
-            rows: Any = _proxy(self._socket).supervisor.getAllProcessInfo()
+            with _proxy(self._socket) as proxy:
+                rows: Any = proxy.supervisor.getAllProcessInfo()
         except (OSError, HTTPException, Fault):
             return []
         return list(rows)
@@ -155,8 +156,8 @@ class Supervisor:
                 os.kill(pid, signal.SIGSTOP)
         for process in processes.PROCESSES:
             name = f"{_group(process.stop_order)}:{program(drone_id, process.name)}"
-            with contextlib.suppress(Fault):  # it was not running
-                _proxy(self._socket).supervisor.stopProcess(name, False)
+            with contextlib.suppress(Fault), _proxy(self._socket) as proxy:  # Fault: it was not running
+                proxy.supervisor.stopProcess(name, False)
 
     def stop(self) -> None:
         """Stop the tree in its order and wait for it."""
