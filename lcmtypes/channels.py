@@ -62,6 +62,7 @@ CHANNELS = (
 )
 # What the simulator says on the world's own group and in truth.mcap; it is on no drone's bus.
 WORLD_STATE = "WORLD_STATE"
+WORLD_COMMAND = "WORLD_COMMAND"  # JSON, from the run's own tool: begin, faults
 WORLD_CHANNELS = (Channel(WORLD_STATE, podwatch.world_state_t, rate_hz=50),)
 BY_NAME = {channel.name: channel for channel in (*CHANNELS, *WORLD_CHANNELS)}
 CROSSING = tuple(channel for channel in CHANNELS if channel.crosses)

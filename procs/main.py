@@ -36,7 +36,7 @@ def main() -> None:
     try:
         runtime = BusRuntime(arguments.process, DroneSettings.read(arguments.settings))
         importlib.import_module(processes.BY_NAME[arguments.process].module).setup(runtime)
-    except (RuntimeFailure, MissionError) as error:
+    except (RuntimeFailure, MissionError, OSError) as error:
         sys.stderr.write(f"{arguments.process}: {error}\n")
         sys.exit(EXIT_CANNOT_START)
     runtime.run()

@@ -15,9 +15,6 @@ from lcmtypes.podwatch import box_t, detections_t, frame_t
 from procs.detector.yolo import ModelError
 from procs.runtime import Runtime, RuntimeFailure
 
-# A frame this much before its turn still counts, so that 5 Hz of a 20 Hz camera is each fourth frame.
-EARLY_SHARE = 0.25
-
 
 class DetectorShell:
     """Chooses frames, runs the detector and says what it found."""
@@ -29,13 +26,15 @@ class DetectorShell:
             self._detector = runtime.open("detector")
         except ModelError as error:
             raise RuntimeFailure(str(error)) from error
-        self._period_us = 1e6 / runtime.settings.mission.camera.detect_hz
+        camera = runtime.settings.mission.camera
+        # Half a frame early is in time, so that 5 Hz of a 20 Hz camera is each fourth frame.
+        self._least_gap_us = 1e6 / camera.detect_hz - 0.5e6 / camera.rate_hz
         self._last_utime = 0
 
     def on_frame(self, frame: frame_t) -> None:
         """Search one frame, if it is time for one."""
         since_us = frame.utime - self._last_utime
-        if 0 <= since_us < self._period_us * (1 - EARLY_SHARE):
+        if 0 <= since_us < self._least_gap_us:
             return
         image = self._frames.read(frame)
         if image is None:

@@ -24,7 +24,9 @@ __all__ = ["UPKEEP", "Finished", "Registrar", "RingPacket"]
 
 Array = NDArray[np.float64]
 
-NEAREST_FRAME_US = 100_000  # a frame further from the instant t is no view of it (DESIGN section 4)
+# A frame further from the instant t is no view of it. At 5 Hz t may lie 100 ms from both frames beside it: a
+# limit of just that (DESIGN section 4) made a drone blind by a hair, and in every episode again.
+NEAREST_FRAME_US = 200_000
 DETECTED_AFTER_US = 450_000  # by then the detector has said what it found at t
 SECOND_LOOK_US = 1_200_000  # a pair's second instant, at least 1 s after the first
 SAID_AFTER_END_US = 1_500_000  # a finished drone repeats its packets, so that the others end too
@@ -34,6 +36,7 @@ EDGE_PX = 3.0  # a box this near to the edge is cut by it
 # sights running is that animal.
 TAKE_UP_LENGTHS = 0.4
 TAKE_UP_SIGHTS = 4
+TAKE_UP_WITHIN_US = 8_000_000  # an animal that nobody saw for longer may be another's length away
 CORRECTION_GAIN = 0.05
 FAR_AHEAD_US = 10_000_000  # an instant further ahead was told by a clock that is not the fleet's
 UPKEEP = -1  # ring_map_t.instant of a packet of the map's upkeep
@@ -120,7 +123,7 @@ class Registrar:
         ground = apply_homography(self._camera.image_to_ground(pose), centres)
         sighting = self.carrier.update(utime, boxes, ground, self._whole(boxes))
         if self.finished is not None and self.running is None:
-            self._take_up(sighting, pose)
+            self._take_up(sighting, pose, fleet_utime)
         return sighting, self._note_sights(sighting, pose, fleet_utime)
 
     def _whole(self, boxes: Array) -> NDArray[np.bool_]:
@@ -229,6 +232,7 @@ class Registrar:
             image_size=self._camera.image_size,
             view=view,
             memory=memory,
+            is_blind=look.sighting is None,
             **options,
         )
         for lost in running.lost:
@@ -290,6 +294,9 @@ class Registrar:
             if pose is not None and result.has_pose:
                 turn = float(np.angle(np.exp(1j * (result.yaw_rad - pose.yaw_rad))))
                 self.correction = Correction(result.n_m - pose.n_m, result.e_m - pose.e_m, turn)
+        else:
+            # Without a view of this episode all names are of an older one, whose ids may have been others.
+            self.carrier.name(Sighting(look.t_utime, np.zeros((0, 4)), np.zeros((0, 2)), ()), [])
         if self.finished is not None and self.finished.consensus:  # what was not agreed is not remembered
             self.memory = result.memory
         mine = set(result.identities.tolist())
@@ -315,12 +322,16 @@ class Registrar:
         entry = self.map.entries.get(animal)
         return entry.seen_fleet_utime if entry is not None else 0
 
-    def _take_up(self, sighting: Sighting, pose: Pose) -> None:
+    def _take_up(self, sighting: Sighting, pose: Pose, fleet_utime: int) -> None:
         """Name boxes that have no name by the map, where one animal alone is near enough (DESIGN section 4,
         MONITOR).
         """
         held = set(self.carrier.held_ids(sighting.utime, SEEN_NOW_US))
-        free = [entry for entry in self.map.entries.values() if entry.animal not in held]
+        free = [
+            entry
+            for entry in self.map.entries.values()
+            if entry.animal not in held and fleet_utime - entry.seen_fleet_utime <= TAKE_UP_WITHIN_US
+        ]
         unnamed = [
             (animal, self.correction.to_map(position, pose))
             for animal, position in zip(sighting.followed, sighting.ground_m, strict=True)

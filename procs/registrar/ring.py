@@ -88,8 +88,12 @@ class RingNode:
         view: ViewGeometry | None = None,
         memory: Memory | None = None,
         register: Register = align_marks,
+        is_blind: bool = False,
     ) -> None:
         """`members` are drone ids in ring order, `boxes` (N, 4) px of the frame at the episode's instant.
+
+        is_blind: there was no frame at that instant. Such a drone hands the map on, and its edge has no
+        confidence, so that nobody takes its silence for a confirmation.
 
         Raises ValueError for a drone that is no member, a repeated member or a bad box (naming the row).
         """
@@ -104,6 +108,7 @@ class RingNode:
         self._observer = Observer(self.boxes, image_size, view, self.memory, register)
         self.bytes_sent = 0
         self.packets_refused = 0
+        self._is_blind = is_blind
         self._lost: list[int] = []
         self._newest: tuple[MapHeader, list[MapAnimal], bytes] | None = None
         self._sight = Sight()
@@ -265,7 +270,8 @@ class RingNode:
             flags |= CHANGED | REPAIRED
         if opens_lap and was_fused and sight.ids == before.ids and is_told:
             flags |= CLOSED
-        least = sight.confidence if opens_lap else min(header.confidence, sight.confidence)
+        confidence = 0.0 if self._is_blind else sight.confidence
+        least = confidence if opens_lap else min(header.confidence, confidence)
         return replace(header, flags=flags, confidence=least if header.lap >= 2 else 1.0), animals
 
     def _verdict(self, header: MapHeader, animals: list[MapAnimal]) -> int:

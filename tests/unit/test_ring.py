@@ -163,6 +163,22 @@ def test_a_drone_without_a_view_passes_the_map_on():
     assert is_ring_right(views, answer)
 
 
+@pytest.mark.parametrize("blind_row", [0, 1])
+def test_a_drone_that_had_no_frame_confirms_nothing(blind_row):
+    views = views_of(5, 2, seed=9)
+    nodes = [
+        RingNode(
+            *(row + 1, [1, 2], EPISODE, PROPOSER),
+            np.zeros((0, 4)) if row == blind_row else view.boxes,
+            image_size=IMAGE_SIZE,
+            is_blind=row == blind_row,
+        )
+        for row, view in enumerate(views)
+    ]
+    fly(nodes, ring_links(2))
+    assert not any(node.result.consensus for node in nodes)
+
+
 def test_a_line_ends_as_a_ring_does():
     views = views_of(5, 4, seed=10)
     ring, line = nodes_of(views), nodes_of(views)

@@ -22,7 +22,6 @@ from tools.sim.buses import Slot, bus_url, free_udp_ports
 from tools.sim.plan import RunPlan
 from tools.sim.supervision import Supervisor, SupervisorError, program
 from tools.sim.watch import Watch
-from tools.sim.world_process import COMMAND_CHANNEL
 
 __all__ = ["ProcessFleet"]
 
@@ -128,7 +127,7 @@ class ProcessFleet:
         self._watch.hear(drone_id, channel, data)
 
     def _command(self, **command: Any) -> None:
-        self._world.publish(COMMAND_CHANNEL, json.dumps(command).encode())
+        self._world.publish(channels.WORLD_COMMAND, json.dumps(command).encode())
 
     def _write_settings(self) -> None:
         output = self.plan.folder / "output"

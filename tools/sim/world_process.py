@@ -30,9 +30,8 @@ from tools.sim.plan import RunPlan
 from tools.sim.settings import SimMission
 from tools.sim.truth import TruthWriter
 
-__all__ = ["COMMAND_CHANNEL", "WorldProcess", "main"]
+__all__ = ["WorldProcess", "main"]
 
-COMMAND_CHANNEL = "WORLD_COMMAND"
 TRUTH_PERIOD_US = 50_000
 PACE_PERIOD_US = 500_000
 LATE_LIMIT_S = 0.15  # of simulation time: later than this, setpoints come near their expiry
@@ -51,7 +50,7 @@ class WorldProcess:
         self._clock = ClockPage(Path(settings["clock_page"]))
         self._rate = 0.0
         self._lcm = lcm.LCM(world_url(settings["slot"]))
-        self._lcm.subscribe(COMMAND_CHANNEL, self._command)
+        self._lcm.subscribe(channels.WORLD_COMMAND, self._command)
         self._links = {
             int(drone_id): MavlinkUdpClient(f"127.0.0.1:{port}", int(drone_id))
             for drone_id, port in settings["mavlink_ports"].items()
