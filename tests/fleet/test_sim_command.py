@@ -102,14 +102,15 @@ def simulated_s(parent: Path) -> float:
 
 @pytest.mark.timeout(240)
 def test_ctrl_c_stops_a_fleet_of_processes_in_order_and_judges_what_was_logged(tmp_path):
-    command = [*PODWATCH, *QUICK, "--duration", "300", "--out", str(tmp_path)]
+    runs = tmp_path / "my runs, 100 %"  # as people call folders
+    command = [*PODWATCH, *QUICK, "--duration", "300", "--out", str(runs)]
     # Its own group, as at a prompt: Ctrl-C reaches all of the group at once.
     sim = subprocess.Popen(
         command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
     )
     try:
         deadline = time.monotonic() + START_LIMIT_S
-        while simulated_s(tmp_path) < 1.0:
+        while simulated_s(runs) < 1.0:
             assert time.monotonic() < deadline, "the clock has not begun to run"
             assert sim.poll() is None, sim.communicate()
             select.select([], [], [], 0.1)
@@ -117,11 +118,11 @@ def test_ctrl_c_stops_a_fleet_of_processes_in_order_and_judges_what_was_logged(t
         said, errors = sim.communicate(timeout=STOP_LIMIT_S)
     finally:
         sim.kill()
-        sim.wait()
+        sim.communicate()
     assert sim.returncode == 130, errors
     assert "Stopped before its end; what was logged is judged." in said
     assert errors == ""
-    [folder] = tmp_path.iterdir()
+    [folder] = runs.iterdir()
     summary = json.loads((folder / "summary.json").read_text())
     assert (summary["mode"], summary["fallback_reason"]) == ("processes", None)
     assert (folder / "report.html").exists()

@@ -3,6 +3,7 @@
 import configparser
 import contextlib
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -39,16 +40,16 @@ def configuration(folder: Path, socket: Path, roster: tuple[int, ...]) -> config
     config["unix_http_server"] = {"file": str(socket), "chmod": "0700"}
     config["supervisord"] = {
         "nodaemon": "true",
-        "logfile": str(folder / "output" / "supervisord.log"),
-        "pidfile": str(folder / "output" / "supervisord.pid"),
-        "childlogdir": str(folder / "output"),
+        "logfile": _plain(folder / "output" / "supervisord.log"),
+        "pidfile": _plain(folder / "output" / "supervisord.pid"),
+        "childlogdir": _plain(folder / "output"),
         "environment": ONE_THREAD,
     }
     factory = "supervisor.rpcinterface:make_main_rpcinterface"
     config["rpcinterface:supervisor"] = {"supervisor.rpcinterface_factory": factory}
     config["supervisorctl"] = {"serverurl": f"unix://{socket}"}
     config[f"program:{WORLD}"] = {
-        "command": f"{sys.executable} -m tools.sim.world_process {folder / 'output' / 'world.json'}",
+        "command": _command("-m", "tools.sim.world_process", folder / "output" / "world.json"),
         "priority": "1",
         **_common(folder, WORLD),
         "autorestart": "false",
@@ -60,7 +61,7 @@ def configuration(folder: Path, socket: Path, roster: tuple[int, ...]) -> config
             groups.setdefault(process.stop_order, []).append(name)
             settings = folder / "output" / f"drone_{drone_id}.json"
             config[f"program:{name}"] = {
-                "command": f"{sys.executable} -m procs.main {process.name} {settings} --end-with-parent",
+                "command": _command("-m", "procs.main", process.name, settings, "--end-with-parent"),
                 **_common(folder, name),
                 "autorestart": "unexpected" if process.restart_ground is Restart.ALWAYS else "false",
             }
@@ -76,16 +77,26 @@ def _group(stop_order: int) -> str:
     return f"stop_{stop_order}"
 
 
+def _command(*words: str | Path) -> str:
+    """A command of this Python for supervisord, whatever the folders are called."""
+    return _plain(shlex.join([sys.executable, *map(str, words)]))
+
+
+def _plain(text: str | Path) -> str:
+    """Text in which supervisord, which expands %(name)s, expands nothing."""
+    return str(text).replace("%", "%%")
+
+
 def _common(folder: Path, name: str) -> dict[str, str]:
     return {
-        "directory": str(folder),
+        "directory": _plain(folder),
         "startsecs": "1",
         "startretries": str(START_TRIES),
         "exitcodes": str(EXIT_CANNOT_START),
         "stopsignal": "TERM",
         "stopwaitsecs": str(STOP_WAIT_S),
         "redirect_stderr": "true",
-        "stdout_logfile": str(folder / "output" / f"{name}.txt"),
+        "stdout_logfile": _plain(_plain(folder / "output" / f"{name}.txt")),  # it expands this one twice
         "stdout_logfile_maxbytes": "1MB",
     }
 
