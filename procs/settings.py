@@ -133,7 +133,7 @@ class Mission(Section):
 
     name: str = "mission"
     origin: OriginSettings = OriginSettings()
-    drones: tuple[DroneEntry, ...] = tuple(DroneEntry(id=i, home_e_m=6.0 * (i - 1)) for i in (1, 2, 3))
+    drones: tuple[DroneEntry, ...] = tuple(DroneEntry(id=i, home_e_m=10.0 * (i - 1)) for i in (1, 2, 3))
     camera: CameraSettings = CameraSettings()
     search: SearchSettings = SearchSettings()
     watch: WatchSettings = WatchSettings()

@@ -218,7 +218,13 @@ def _agreement(now: Situation, memory: Memory) -> bool | None:
 
 
 def _seen_again(now: Situation, memory: Memory) -> bool:
-    """The animal that this drone gave up is in the map again, fresh, and nobody else watches it."""
+    """The animal that this drone gave up is in the map again, fresh, and nobody else watches it.
+
+    Not by the word of an episode that began since: that one assigns everybody anew.
+    """
+    identities = now.inputs.identities
+    if identities is None or identities.episode_running or episode_key(identities) > memory.gather_key:
+        return False
     taken = any(row.animal == memory.lost_animal for row in now.others)
     return memory.lost_animal >= 0 and not taken and now.map_position(memory.lost_animal, 2.0) is not None
 

@@ -52,13 +52,15 @@ def slot(
     """(3,) NED place number `rank` of `n` on the circle: at 360 rank/n degrees from north, in its layer."""
     angle = 2 * np.pi * rank / n + rotation_rad
     radius_m = circle_radius(separation_m, n)
-    layer = 1 + LAYER_SPAN * (rank % N_LAYERS) / (N_LAYERS - 1) if n > 1 else 1.0
+    # The last of four, seven, ... stands beside the first: never in its layer.
+    number = 1 if rank == n - 1 and n % N_LAYERS == 1 else rank % N_LAYERS
+    layer = 1 + LAYER_SPAN * number / (N_LAYERS - 1) if n > 1 else 1.0
     return np.array(
         [centre_ne[0] + radius_m * np.cos(angle), centre_ne[1] + radius_m * np.sin(angle), -height_m * layer]
     )
 
 
-def layer_heights(n: int, lowest_m: float, highest_m: float, step_m: float = 5.0, most: int = 4) -> Array:
+def layer_heights(n: int, lowest_m: float, highest_m: float, step_m: float = 6.0, most: int = 4) -> Array:
     """(n,) heights by rank: up to `most` layers `step_m` apart from lowest_m, closer together where
     highest_m is near.
     """

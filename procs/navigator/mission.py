@@ -33,7 +33,7 @@ Behaviour = Callable[[Situation, Memory, Pinhole], Step]
 # What is left of the circle's separation before drones push each other apart; never so little that the noise
 # of two positions could use it up.
 CLEARANCE_SHARE = 0.6
-LEAST_CLEARANCE_M = 4.5
+LEAST_CLEARANCE_M = 5.5
 
 BEHAVIOURS: dict[State, Behaviour] = {
     State.IDLE: behaviours.idle,
@@ -143,6 +143,9 @@ class Navigator:
         elif target == State.RENDEZVOUS:
             if memory.state not in (State.REGISTER, State.ASSIGN):
                 memory.gather_since_us = inputs.utime
+            if memory.state == State.MONITOR and memory.find is not None:
+                memory.barycentre.reset()  # what it saw of the pod was before the watch
+                memory.barycentre.start_at(memory.find.ne, memory.find.radius_m)
             memory.gather_key = max(memory.gather_key, episode_key(inputs.identities))
             memory.station_since_us, memory.station_error_m = 0, 100.0
             memory.animal, memory.surplus, memory.conflict_since_us = -1, False, 0

@@ -16,6 +16,8 @@ Array = NDArray[np.float64]
 
 BLIND_S = 3.0  # unseen for so long: the map knows better than the prediction
 GIVE_UP_S = 40.0  # twice a dive of 20 s
+UNSURE_S = 10.0  # unseen for so long, an animal's place no longer says who it is
+STRANGERS_S = 3.0
 WIDEN_M_S = 0.7  # climb while the animal is not seen
 WIDEN_MOST_M = 10.0
 CONFLICT_S = 4.0
@@ -56,6 +58,7 @@ def conflict(now: Situation, memory: Memory) -> bool:
     """Two drones over one animal, or the own animal away from its place in the map, for longer than 4 s."""
     length_m = now.mission.watch.animal_length_m
     own = memory.animal_filter.at(now.utime)
+    is_seen = now.seconds_since(memory.seen_us) <= BLIND_S  # a prediction accuses nobody
     entry = now.map_entry(memory.animal)
     doubted = entry is not None and entry.mine and entry.residual_m > length_m
     for row in now.others:
@@ -69,7 +72,7 @@ def conflict(now: Situation, memory: Memory) -> bool:
         mine = now.map_position(memory.animal)
         # Two animals that swim side by side are no conflict: the map says whether they do.
         apart = theirs is None or mine is None or float(np.linalg.norm(theirs - mine)) > length_m
-        near = own is not None and float(np.linalg.norm(own - [row.n_m, row.e_m])) < length_m / 2
+        near = own is not None and is_seen and float(np.linalg.norm(own - [row.n_m, row.e_m])) < length_m / 2
         doubted = doubted or (near and apart and now.row_age_s(row) < 2.0)
     if not doubted:
         memory.conflict_since_us = 0
@@ -91,7 +94,7 @@ def monitor(now: Situation, memory: Memory, camera: Pinhole) -> Step:
     step = _over_animal(now, memory, unseen_s)
     if now.command == podwatch.operator_t.LEAVE and _told_to_leave(now, memory):
         event = Event.LEAVE
-    elif unseen_s > GIVE_UP_S:
+    elif unseen_s > GIVE_UP_S or (unseen_s > UNSURE_S and _only_strangers(now, memory)):
         memory.lost_animal = memory.animal
         event = Event.ANIMAL_LOST
     elif conflict(now, memory):
@@ -99,6 +102,18 @@ def monitor(now: Situation, memory: Memory, camera: Pinhole) -> Step:
         event = Event.CONFLICT
     step.event = event
     return step
+
+
+def _only_strangers(now: Situation, memory: Memory) -> bool:
+    """Animals are in view for a while and none of them has a name any more: only a new episode can tell them
+    apart.
+    """
+    identities = now.inputs.identities
+    if identities is None or identities.n_boxes == 0 or any(animal >= 0 for animal in identities.ids):
+        memory.strangers_since_us = 0
+    elif memory.strangers_since_us == 0:
+        memory.strangers_since_us = now.utime
+    return memory.strangers_since_us > 0 and now.seconds_since(memory.strangers_since_us) > STRANGERS_S
 
 
 def _told_to_leave(now: Situation, memory: Memory) -> bool:

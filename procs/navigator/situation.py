@@ -99,6 +99,7 @@ class Memory:
     assigned_key: EpisodeKey = (0, 0)
     seen_us: int = 0  # capture time of the last sight of the own animal
     conflict_since_us: int = 0
+    strangers_since_us: int = 0  # since when MONITOR sees animals without names only, 0 while it does not
     n_conflicts: int = 0
     detections_us: int = 0  # capture time of the newest detections that were taken in
     first_watch_us: int = 0  # when the first drone was seen in MONITOR, 0 while none is

@@ -136,6 +136,12 @@ def test_a_circle_worked_by_hand() -> None:
         gather_height(1.0, 0.0, np.radians(9), 10.0, 60.0)
 
 
+@pytest.mark.parametrize("n", range(2, 11))
+def test_neighbours_on_the_circle_stand_in_different_layers(n: int) -> None:
+    heights = [float(slot(rank, n, np.zeros(2), 8.0, 40.0)[2]) for rank in range(n)]
+    assert all(abs(heights[rank] - heights[rank - 1]) > 2.9 for rank in range(n))
+
+
 def test_every_drone_of_the_circle_sees_the_whole_pod_at_five_degrees_of_tilt() -> None:
     n, pod_m = 5, 15.0
     height_m = gather_height(pod_m, circle_radius(8.0, n), CAMERA.vfov_rad, 10.0, 200.0)
@@ -149,7 +155,7 @@ def test_every_drone_of_the_circle_sees_the_whole_pod_at_five_degrees_of_tilt() 
 
 
 def test_layers_use_the_room_that_there_is() -> None:
-    np.testing.assert_allclose(layer_heights(5, 12.0, 80.0), [12, 17, 22, 27, 12])
+    np.testing.assert_allclose(layer_heights(5, 12.0, 80.0), [12, 18, 24, 30, 12])
     np.testing.assert_allclose(layer_heights(3, 12.0, 18.0), [12, 15, 18])
     np.testing.assert_allclose(layer_heights(1, 12.0, 80.0), [12])
     np.testing.assert_allclose(layer_heights(2, 30.0, 20.0), [20, 20])

@@ -5,7 +5,7 @@ old, no clock.
 import numpy as np
 import pytest
 
-from lcmtypes import podwatch
+from lcmtypes import make, podwatch
 from procs.navigator.mission import Navigator
 from procs.navigator.states import State
 from tests.unit.navigator_flights import Drone, Fleet, mission
@@ -134,6 +134,19 @@ def test_an_animal_that_stays_away_sends_the_drone_back_to_gather() -> None:
     fleet.run(1.0)
     assert fleet.drone(1).navigator.state == State.MONITOR
     assert fleet.drone(1).navigator.memory.animal == 0
+
+
+def test_a_pod_that_comes_up_as_strangers_is_agreed_on_anew_without_waiting() -> None:
+    fleet = flown_to(State.MONITOR)
+    fleet.run(3.0)
+    fleet.visible = False
+    fleet.run(12.0)
+    assert fleet.all_in(State.MONITOR), "nothing to be seen: it waits for its animal"
+    box = make(podwatch.box_t, left_px=1, right_px=2, top_px=1, bottom_px=2)
+    strangers = make(podwatch.identities_t, episode=1, consensus=True, n_boxes=1, boxes=[box], ids=[-1])
+    fleet._identities = lambda: strangers
+    waited_s = fleet.run(20.0, lambda: fleet.all_in(State.RENDEZVOUS))
+    assert 2.9 < waited_s < 4.0
 
 
 def test_a_drone_lost_in_monitor_leaves_the_others_at_work() -> None:

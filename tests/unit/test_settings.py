@@ -27,7 +27,7 @@ def test_a_file_that_says_nothing_is_the_default_fleet_of_three(tmp_path):
     mission = load_mission(written(tmp_path, ""), Mission)
     assert mission == Mission()
     assert mission.roster == (1, 2, 3)
-    assert mission.home(2).home_e_m == 6.0
+    assert mission.home(2).home_e_m == 10.0
 
 
 def test_the_roster_is_in_ring_order_whatever_the_order_of_the_file(tmp_path):
