@@ -26,6 +26,7 @@ EXIT_CODES = {
     ("procs.detector.decode", "ModelError"): MISSING,
     ("procs.relay.keys", "FleetKeyError"): MISSING,
     ("procs.runtime", "RuntimeFailure"): MISSING,
+    ("tools.sim.supervision", "CannotStartError"): MISSING,
     ("tools.sim.supervision", "SupervisorError"): FAILED,
 }
 

@@ -129,3 +129,23 @@ def test_ctrl_c_stops_a_fleet_of_processes_in_order_and_judges_what_was_logged(t
     assert processes_of(folder) == []
     named = clock_page(folder).name.removesuffix("clock")
     assert [path.name for path in SHARED_FOLDER.glob(f"{named}*")] == []
+
+
+def test_a_process_that_cannot_start_ends_the_run_at_once_and_says_why(tmp_path):
+    """The address of the autopilot is another program's."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{other.getsockname()[1]}"
+        done = subprocess.run(
+            [*PODWATCH, *QUICK, "--out", str(tmp_path), "--autopilot", address],
+            cwd=ROOT,
+            capture_output=True,
+            text=True,
+            timeout=START_LIMIT_S,
+        )
+    assert done.returncode == 3, done.stderr
+    assert f"world: cannot listen on udp {address}" in done.stderr
+    assert "does another program use it?" in done.stderr
+    assert "Traceback" not in done.stderr
+    [folder] = tmp_path.iterdir()
+    assert processes_of(folder) == []

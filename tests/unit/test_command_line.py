@@ -17,7 +17,7 @@ from procs.settings import MissionError
 from tools import errors
 from tools.cli import app
 from tools.sim import command, run
-from tools.sim.supervision import SupervisorError
+from tools.sim.supervision import CannotStartError, SupervisorError
 from tools.sim.watch import Watch
 
 QUICK = ("--lockstep", "--headless", "--sensor", "boxes", "--duration", "2")
@@ -167,6 +167,7 @@ def test_ctrl_c_before_anything_flew_leaves_nothing_to_judge(tmp_path, monkeypat
         (MissionError("a"), 2),
         (ModelError("a"), 3),
         (SupervisorError("a"), 1),
+        (CannotStartError("a"), 3),
         (PermissionError(13, "Permission denied", "a"), 3),
         (OSError("all 50 slots are taken"), 3),
         (FileExistsError("a"), 3),

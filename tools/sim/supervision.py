@@ -17,7 +17,7 @@ from procs import processes
 from procs.main import EXIT_CANNOT_START
 from procs.processes import Restart
 
-__all__ = ["Supervisor", "SupervisorError", "configuration", "program"]
+__all__ = ["CannotStartError", "Supervisor", "SupervisorError", "configuration", "program"]
 
 STOP_WAIT_S = 6
 START_TRIES = 5
@@ -27,6 +27,10 @@ ONE_THREAD = "OMP_NUM_THREADS=1,OPENBLAS_NUM_THREADS=1,MKL_NUM_THREADS=1"
 
 class SupervisorError(Exception):
     """The process tree cannot start or fell; the message says which process, why, and where it wrote."""
+
+
+class CannotStartError(SupervisorError):
+    """A process says that it cannot start: what it was given, or this machine, is not enough."""
 
 
 def program(drone_id: int, process: str) -> str:
@@ -144,12 +148,14 @@ class Supervisor:
             raise SupervisorError(f"supervisord ended with code {self._popen.returncode}; see {self._output}")
         for row in self._rows():
             name, state = row["name"], row["statename"]
-            # What was killed is EXITED too, for the moment until it is started again.
-            is_final = state == "EXITED" and (name == WORLD or row["exitstatus"] == EXIT_CANNOT_START)
-            if state == "FATAL" or is_final:
+            # What was killed is EXITED too, for the moment until it is started again. What says that it
+            # cannot start is not tried five times.
+            cannot = state in ("EXITED", "BACKOFF", "FATAL") and row["exitstatus"] == EXIT_CANNOT_START
+            if cannot or state == "FATAL" or (state == "EXITED" and name == WORLD):
                 output = (self._output / f"{name}.txt").read_text(errors="replace").strip()
                 last = output.splitlines()[-1] if output else "it said nothing"
-                raise SupervisorError(f"{name} cannot run: {last} (all it said: {self._output / name}.txt)")
+                kind = CannotStartError if cannot else SupervisorError
+                raise kind(f"{name} cannot run: {last} (all it said: {self._output / name}.txt)")
 
     def _rows(self) -> list[dict[str, Any]]:
         """supervisord's account of each program; empty while it does not answer."""
