@@ -1,25 +1,32 @@
-# Two commands: `make sim` flies the default mission, `make test` runs all that CI runs. Both make the environment first.
+# Two commands: `make sim` flies the default mission, `make test` runs all that CI runs. Each makes what it needs first.
 PYTHON ?= python3
 VENV := .venv
-STAMP := $(VENV)/.installed
+FLIES := $(VENV)/.flies
+TESTS := $(VENV)/.tests
+SOURCES := pyproject.toml $(wildcard lcmtypes/*.lcm) lcmtypes/hatch_build.py tools/make_venv.sh
 
 .PHONY: sim test lint clean
 
-sim: $(STAMP)
+sim: $(FLIES)
 	$(VENV)/bin/podwatch sim
 
-test: $(STAMP) lint
+test: lint
 	$(VENV)/bin/python -m pytest -n 2 --dist worksteal
 
-lint: $(STAMP)
+lint: $(TESTS)
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/ruff format --check .
 	$(VENV)/bin/mypy
 
 # Made anew when the dependencies or the messages change.
-$(STAMP): pyproject.toml $(wildcard lcmtypes/*.lcm) lcmtypes/hatch_build.py tools/make_venv.sh
-	sh tools/make_venv.sh $(PYTHON) $(VENV)
+$(FLIES): $(SOURCES)
+	sh tools/make_venv.sh $(PYTHON) $(VENV) .
 	touch $@
+
+# The tests also train (a few steps), which needs torch.
+$(TESTS): $(SOURCES)
+	sh tools/make_venv.sh $(PYTHON) $(VENV) '.[dev,train]'
+	touch $@ $(FLIES)
 
 clean:
 	rm -rf $(VENV) lcmtypes/podwatch dist build

@@ -1,6 +1,8 @@
 """The command line: `podwatch COMMAND`. Heavy imports wait until their command is called."""
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
@@ -80,13 +82,8 @@ def train_detector(
     smoke: Annotated[bool, typer.Option("--smoke", help="A few steps, export and check only.")] = False,
 ) -> None:
     """Train the detector and export it to ONNX."""
-    try:
+    with _training_extra():
         from tools.train_detector import Settings, command
-    except ImportError as error:
-        typer.echo(
-            f"podwatch: {error.name} is missing; install the extra: pip install 'podwatch[train]'", err=True
-        )
-        raise typer.Exit(MISSING) from None
     with plain_errors():
         command(out, data, Settings.steps if steps is None else steps, seed, smoke)
 
@@ -104,6 +101,30 @@ def bench_fleet(
 
     with plain_errors():
         command(seeds, out, quick=quick)
+
+
+@bench.command("detection")
+def bench_detection(
+    scenes: Annotated[int, typer.Option(min=1, help="Rendered scenes a set.")] = 300,
+    seed: Annotated[int, typer.Option(min=0)] = 0,
+) -> None:
+    """Recall, precision and AP50 on held-out photographs and rendered scenes."""
+    with _training_extra():
+        from tools.train_detector import evaluate
+    with plain_errors():
+        evaluate(scenes=scenes, seed=seed)
+
+
+@contextmanager
+def _training_extra() -> Iterator[None]:
+    """Say which extra is missing where an import of the trainer's libraries fails."""
+    try:
+        yield
+    except ImportError as error:
+        typer.echo(
+            f"podwatch: {error.name} is missing; install the extra: pip install 'podwatch[train]'", err=True
+        )
+        raise typer.Exit(MISSING) from None
 
 
 def main() -> None:
