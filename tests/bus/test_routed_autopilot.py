@@ -201,7 +201,7 @@ def test_a_bridge_flies_an_autopilot_of_another_process_and_the_world_sees_it_th
 
 @pytest.mark.timeout(240)
 def test_podwatch_sim_flies_a_real_autopilot_at_real_time(tmp_path):
-    """One drone for 25 s: up it goes, and the clock was never slowed."""
+    """One drone for 15 s: up it goes, and the clock was never slowed."""
     [port] = free_udp_ports(1)
     twin = start_twin(f"udpout:127.0.0.1:{port}", scale=1.0, system_id=1)
     mission = tmp_path / "mission.toml"
@@ -241,4 +241,4 @@ def test_podwatch_sim_flies_a_real_autopilot_at_real_time(tmp_path):
     assert about["autopilots"] == [f"udp:127.0.0.1:{port}"]
     assert about["realtime_factor"] == pytest.approx(1.0, abs=0.02)
     states = [message for _, _, message in read(folder / "truth.mcap", channels=channels.WORLD_STATE)]
-    assert min(state.drones[0].d_m for state in states) < -5.0
+    assert min(state.drones[0].d_m for state in states) < -4.0

@@ -13,8 +13,8 @@ from drivers.radios.memory import MemoryEther
 from lcmtypes import channels, make
 from lcmtypes.podwatch import box_t, detections_t, heartbeat_t, ring_map_t, vehicle_state_t
 from procs.queue_executor import ClockError, EventQueue, QueueRuntime, VirtualBus
+from procs.registrar.process import setup as set_up_registrar
 from procs.relay.process import setup as set_up_relay
-from procs.runtime import RuntimeFailure
 from procs.settings import DroneEntry, DroneSettings, Mission
 
 S = 1_000_000
@@ -95,9 +95,7 @@ def sea_with_boxes(utime: int, *, right_px: float = 140.0) -> detections_t:
 
 def registrar() -> Bench:
     """A registrar that knows where its drone is."""
-    from procs.registrar.process import setup
-
-    bench = Bench("registrar", setup, {})
+    bench = Bench("registrar", set_up_registrar, {})
     show_registrar(bench, 1.0, lambda utime: None)
     return bench
 
@@ -176,12 +174,3 @@ class Relays:
             self.beats.append(heartbeat_t.decode(data))
         elif channel == channels.received(2, channels.RING_MAP):
             self.copies.append(ring_map_t.decode(data))
-
-
-def failure_of(start: Callable[[], Any]) -> str:
-    """What a process says that cannot start."""
-    try:
-        start()
-    except RuntimeFailure as failure:
-        return str(failure)
-    raise AssertionError("it started")

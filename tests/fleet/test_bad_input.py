@@ -21,6 +21,7 @@ from lcmtypes import channels, make
 from lcmtypes.podwatch import detections_t, frame_t, heartbeat_t, setpoint_t, track_t
 from logs.reader import info
 from logs.writer import LogWriter
+from procs.autopilot.process import setup as set_up_bridge
 from procs.camera.process import setup as set_up_camera
 from procs.detector.process import setup as set_up_detector
 from procs.detector.yolo import Detections
@@ -400,8 +401,6 @@ class Flight:
     """The bridge's process with a simulated autopilot at the far end of its link, which is listened to."""
 
     def __init__(self) -> None:
-        from procs.autopilot.process import setup
-
         near, self._far = link_pair(self._deliver, 1)
         self._ear = Codec(1, 1)
         self.targets: list[tuple[int, float, float]] = []  # when it arrived, velocity north and east
@@ -409,7 +408,7 @@ class Flight:
         vehicle = Vehicle((0.0, 0.0), np.random.default_rng(1))
         self.twin = SimAutopilot(vehicle, 1, np.random.default_rng(2), origin=(15.3, -61.5, 0.0))
         self._bench: Bench | None = None
-        self._bench = Bench("autopilot", setup, {"autopilot": near})
+        self._bench = Bench("autopilot", set_up_bridge, {"autopilot": near})
 
     @property
     def queue(self) -> Any:
