@@ -21,6 +21,7 @@ STRANGERS_S = 3.0
 WIDEN_M_S = 0.7  # climb while the animal is not seen
 WIDEN_MOST_M = 10.0
 CONFLICT_S = 4.0
+ON_ITS_WAY_M_S = 0.5  # towards its own animal: a drone that passes over another's is not over it
 MAX_CONFLICTS = 3  # gathering again more often than that would cost more than it mends
 LAYERS = 3
 
@@ -68,18 +69,28 @@ def conflict(now: Situation, memory: Memory) -> bool:
             # Of two that claim one animal the higher id gathers again; the lower keeps it in view.
             doubted = doubted or row.id < now.drone_id
             continue
-        theirs = now.map_position(row.animal)
-        mine = now.map_position(memory.animal)
-        # Two animals that swim side by side are no conflict: the map says whether they do.
-        apart = theirs is None or mine is None or float(np.linalg.norm(theirs - mine)) > length_m
         near = own is not None and is_seen and float(np.linalg.norm(own - [row.n_m, row.e_m])) < length_m / 2
-        doubted = doubted or (near and apart and now.row_age_s(row) < 2.0)
+        doubted = doubted or (near and now.row_age_s(row) < 2.0 and _is_astray(now, memory, row))
     if not doubted:
         memory.conflict_since_us = 0
     elif memory.conflict_since_us == 0:
         memory.conflict_since_us = now.utime
     lasted = memory.conflict_since_us > 0 and now.seconds_since(memory.conflict_since_us) > CONFLICT_S
     return lasted and memory.n_conflicts < MAX_CONFLICTS
+
+
+def _is_astray(now: Situation, memory: Memory, row: podwatch.fleet_row_t) -> bool:
+    """Whether a drone over this one's animal has no business there: its own is elsewhere, and it is not under
+    way to it.
+    """
+    theirs, mine = now.map_position(row.animal), now.map_position(memory.animal)
+    if theirs is None or mine is None:
+        return True
+    # Two animals that swim side by side are no conflict: the map says whether they do.
+    if float(np.linalg.norm(theirs - mine)) <= now.mission.watch.animal_length_m:
+        return False
+    way = theirs - [row.n_m, row.e_m]
+    return float(way @ [row.vn_m_s, row.ve_m_s]) <= ON_ITS_WAY_M_S * float(np.linalg.norm(way))
 
 
 def monitor(now: Situation, memory: Memory, camera: Pinhole) -> Step:

@@ -156,6 +156,29 @@ def test_a_drone_lost_in_monitor_leaves_the_others_at_work() -> None:
     assert fleet.all_in(State.MONITOR)
 
 
+@pytest.mark.parametrize(("towards_m_s", "ends_in"), [(0.0, State.RENDEZVOUS), (1.5, State.MONITOR)])
+def test_a_drone_over_anothers_animal_is_a_conflict_unless_it_passes_on_to_its_own(
+    towards_m_s: float, ends_in: State
+) -> None:
+    fleet = flown_to(State.MONITOR)
+    fleet.run(10.0)
+    first, second = fleet.drone(1), fleet.drone(2)
+    mine, theirs = (fleet.animals[drone.navigator.memory.animal] for drone in (first, second))
+    way = (theirs - mine) / np.linalg.norm(theirs - mine)
+    share = fleet._share
+
+    def say_it_is_over_the_first_ones_animal() -> None:
+        share()
+        for row in fleet.rows:
+            if row.id == 2:
+                row.n_m, row.e_m = mine
+                row.vn_m_s, row.ve_m_s = towards_m_s * way
+
+    fleet._share = say_it_is_over_the_first_ones_animal
+    fleet.run(5.0)
+    assert first.navigator.state == ends_in
+
+
 def test_of_two_drones_with_one_animal_the_higher_gathers_again() -> None:
     fleet = flown_to(State.MONITOR, n=2)
     fleet.run(2.0)
