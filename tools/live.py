@@ -237,7 +237,7 @@ def _cells(row: _Row, now_s: float) -> tuple[str, ...]:
     """Animal, height, battery, links, camera, detector, tracker, log."""
     return (
         str(row.identity) if row.identity >= 0 else "-",
-        "-" if row.height_m is None else f"{row.height_m:.0f} m",
+        "-" if row.height_m is None else f"{round(row.height_m)} m",
         "-" if row.battery is None else f"{row.battery:.0%}",
         "-" if row.links is None else f"{row.links[0]}/{row.links[1]}",
         _rate(row, channels.FRAME, now_s),
