@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,8 +20,9 @@ from procs.registrar.ring import RingNode
 from procs.settings import load_mission
 from tests.fleet.conftest import new_plan
 from tools.sim.expect import Safety, check, read_safety
+from tools.sim.plan import RunPlan
 from tools.sim.run import fly_lockstep
-from tools.sim.settings import SimMission
+from tools.sim.settings import Expect, SimMission
 from tools.summary import write_summary
 
 SCENARIOS = (
@@ -36,6 +38,7 @@ SCENARIOS = (
 )
 CAMERA_HZ = 10.0  # of boxes; half the work of the 20 Hz that pixels are flown with
 ABLATION_S = 75.0  # the same fleet watches after 50 s when it registers what it sees
+PIXELS_S = 65.0  # two drones come to watch after 45 s
 
 
 class Flown(NamedTuple):
@@ -50,9 +53,15 @@ class Flown(NamedTuple):
 def fly(mission: SimMission, folder: Path) -> Flown:
     """Fly a mission in lockstep with boxes at CAMERA_HZ, and judge it."""
     camera = mission.camera.model_copy(update={"rate_hz": CAMERA_HZ})
-    quick = mission.model_copy(update={"camera": camera})
-    fly_lockstep(new_plan(quick, folder), None)
-    return Flown(folder, quick, write_summary(folder), read_safety(folder, quick.limits))
+    plan = new_plan(mission.model_copy(update={"camera": camera}), folder)
+    fly_lockstep(plan, None)
+    return judged(plan)
+
+
+def judged(plan: RunPlan) -> Flown:
+    """What came of a plan that has flown."""
+    safety = read_safety(plan.folder, plan.mission.limits)
+    return Flown(plan.folder, plan.mission, write_summary(plan.folder), safety)
 
 
 @pytest.fixture(scope="module")
@@ -91,6 +100,19 @@ def test_in_a_fleet_of_five_drone_1_hears_of_drones_3_and_4_only_by_the_fleet_ta
     assert {channel for _, channel in copies} == {channel.name for channel in channels.CROSSING}
     tables = [t for _, _, t in read(flight.folder / "drone_1.mcap", channels=channels.FLEET_STATE)]
     assert {row.id for table in tables for row in table.rows if row.alive} == {1, 2, 3, 4, 5}
+
+
+@pytest.mark.timeout(600)
+def test_two_drones_find_agree_and_watch_by_pixels_alone(near, tmp_path):
+    mission = near.model_copy(update={"drones": near.drones[:2], "duration_s": PIXELS_S})
+    plan = replace(new_plan(mission, tmp_path / "run"), sensor="pixels")
+    fly_lockstep(plan, None)
+    flight = judged(plan)
+    assert flight.summary["consensus"], flight.summary["reasons"]
+    watched = [drone["animal"] for drone in flight.summary["drones"]]
+    assert None not in watched
+    assert len(set(watched)) == 2
+    assert check(Expect(drones_in_monitor=2, min_in_image_share=0.9), flight.summary, flight.safety) == []
 
 
 def as_it_stands(source: Marks, target: Marks, *, prior: Any = None) -> BoxAlignment:
