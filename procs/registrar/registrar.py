@@ -208,7 +208,9 @@ class Registrar:
         boxes = look.sighting.boxes if look.sighting else np.zeros((0, 4))
         pose = pose_at(look.sighting.utime if look.sighting else t_utime)
         view = None
-        if pose is not None:
+        if (
+            pose is not None and pose.height_m > 0
+        ):  # on the ground a barometer says less than nothing at times
             view = ViewGeometry(
                 height_m=pose.height_m,
                 yaw_rad=pose.yaw_rad,

@@ -255,6 +255,8 @@ class RingNode:
     ) -> tuple[MapHeader, list[MapAnimal]]:
         """Match own boxes to the map and put this drone's word on it in place of its earlier word."""
         before, was_fused = self._sight, self._fused
+        if not {*before.ids.values()} <= {one.id for one in animals}:
+            before = Sight()  # taken for lost and passed over: this map does not hold the earlier word
         sight, is_told = self._observer.look(header, animals)
         if header.lap == 1 and animals and sight.confidence < FUSE_CONFIDENCE:
             return header, animals

@@ -278,3 +278,12 @@ def test_without_a_pose_or_on_the_ground_a_frame_is_left_out():
     assert registrar.detected(S, boxes, None, S) is None
     assert registrar.detected(S, boxes, Pose(0, 0, -0.5), S) is None
     assert not registrar.carrier.sightings
+
+
+def test_a_member_whose_barometer_puts_it_below_the_ground_takes_part_without_a_view():
+    fleet = Fleet(3)
+    fleet.poses[3] = Pose(0.0, 0.0, 0.3)
+    fleet.run(1.0)
+    fleet.propose(1)
+    fleet.run(9.0)
+    assert all(fleet.finished(k).complete and not fleet.finished(k).consensus for k in fleet.ids)

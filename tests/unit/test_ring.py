@@ -328,3 +328,18 @@ def test_more_boxes_than_a_packet_holds_is_no_error():
     boxes = np.concatenate([corners, corners + rng.uniform(10, 40, (60, 2))], axis=1)
     answer = register_ring([boxes], image_size=IMAGE_SIZE)
     assert (answer.identities[0] >= 0).sum() == 40
+
+
+def test_a_member_that_was_passed_over_while_it_lived_says_its_word_anew():
+    centres = np.array([[150, 150], [450, 120], [300, 300], [520, 380], [120, 400]], float)
+    sides = np.array([[30, 60], [50, 35], [40, 40], [60, 30], [35, 55]], float)
+    boxes = np.hstack([centres - sides / 2, centres + sides / 2])
+    shown = (boxes[:3], boxes, boxes[:3])  # the second alone sees two more
+    nodes = [RingNode(k + 1, [1, 2, 3], 1, 1, seen, image_size=IMAGE_SIZE) for k, seen in enumerate(shown)]
+    first = nodes[0].step([], 0.0)
+    nodes[2].drop_member(2)  # the third takes the second for lost and goes on with the first's map
+    said = [first, nodes[1].step(first, 0.0), nodes[2].step(first, 0.0)]
+    for _ in range(20):
+        said = [node.step(said[k - 1] + said[(k + 1) % 3], 0.0) for k, node in enumerate(nodes)]
+    assert all(node.finished for node in nodes)
+    assert [len({*node.result.identities.tolist()} - {-1}) for node in nodes] == [3, 3, 3]
