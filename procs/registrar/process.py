@@ -21,6 +21,7 @@ from lcmtypes.podwatch import (
     vehicle_state_t,
 )
 from procs.history import PoseHistory, camera_of
+from procs.navigator.states import State
 from procs.registrar.episodes import from_bitmap, to_bitmap
 from procs.registrar.registrar import UPKEEP, Registrar, RingPacket
 from procs.registrar.upkeep import UpkeepError
@@ -28,6 +29,15 @@ from procs.runtime import Runtime
 
 STEP_S = 0.2
 UPKEEP_S = 1.0
+# A drone in one of these is on the ground or near it: it has no view, and one without a view keeps everybody
+# else from consensus.
+GROUNDED = (State.IDLE, State.TAKEOFF, State.LAND, State.LANDED)
+
+
+def able_members(state: fleet_state_t, roster: tuple[int, ...], own_id: int) -> tuple[int, ...]:
+    """Whom this drone asks to an episode: itself, and the living that are not on the ground."""
+    grounded = [row.id for row in state.rows if row.state in GROUNDED and row.id != own_id]
+    return tuple(member for member in from_bitmap(state.members, roster) if member not in grounded)
 
 
 class RegistrarShell:
@@ -49,6 +59,7 @@ class RegistrarShell:
         self._fleet_offset_us = 0
         self._fleet_time_ok = True  # a drone without a relay is a fleet of one
         self._living: tuple[int, ...] = (runtime.drone_id,)
+        self._able: tuple[int, ...] = self._living  # those of them that may see the pod
         self._wants_episode = False
 
     @property
@@ -69,6 +80,7 @@ class RegistrarShell:
         for lost in [member for member in self._living if member not in living]:
             self._registrar.drop_member(lost)
         self._living = living
+        self._able = able_members(state, self._roster, self._runtime.drone_id)
 
     def on_detections(self, message: detections_t) -> None:
         """Follow the boxes and say who they are."""
@@ -148,7 +160,7 @@ class RegistrarShell:
         """Propose, go on with the episode, repeat what is known."""
         runtime, registrar = self._runtime, self._registrar
         if self._wants_episode and self._fleet_time_ok:  # an instant in another time would suit nobody
-            registrar.propose(self._living, runtime.utime, self._fleet_utime)
+            registrar.propose(self._able, runtime.utime, self._fleet_utime)
         said = registrar.book.saying(self._fleet_utime)
         if said is not None:
             runtime.publish(channels.RING_EPISODE, said)

@@ -7,7 +7,11 @@ import pytest
 from numpy.typing import NDArray
 
 from drivers.cameras.pinhole import Pinhole, Pose, apply_homography
+from lcmtypes import make
+from lcmtypes.podwatch import fleet_row_t, fleet_state_t
+from procs.navigator.states import State
 from procs.registrar.box_icp import BoxAlignment
+from procs.registrar.process import able_members
 from procs.registrar.registrar import Finished, Registrar, RingPacket
 
 Array = NDArray[np.float64]
@@ -287,3 +291,11 @@ def test_a_member_whose_barometer_puts_it_below_the_ground_takes_part_without_a_
     fleet.propose(1)
     fleet.run(9.0)
     assert all(fleet.finished(k).complete and not fleet.finished(k).consensus for k in fleet.ids)
+
+
+def test_nobody_on_the_ground_is_asked_to_an_episode():
+    states = {1: State.LANDED, 2: State.REGISTER, 3: State.MONITOR, 4: State.TAKEOFF, 5: State.REGISTER}
+    rows = [make(fleet_row_t, id=drone_id, alive=True, state=state) for drone_id, state in states.items()]
+    state = make(fleet_state_t, members=0b101111, n_rows=len(rows), rows=rows)  # 5 is lost, 6 has no row yet
+    assert able_members(state, (1, 2, 3, 4, 5, 6), own_id=2) == (2, 3, 6)
+    assert able_members(state, (1, 2, 3, 4, 5, 6), own_id=1) == (1, 2, 3, 6)
