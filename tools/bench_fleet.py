@@ -100,7 +100,7 @@ def processes_mode(out: Path) -> Iterator[Row]:
     seed = str(summary["seed"])
     latency = summary["camera_to_setpoint_ms"]
     figure: str | None
-    if latency:
+    if latency["p50"] is not None:
         figure = f"{latency['p50']:.0f} ms, {latency['p99']:.0f} ms"
         yield Row("camera to setpoint, p50 and p99", 1, seed, figure, "p99 <= 250 ms", latency["p99"] <= 250)
     else:

@@ -91,6 +91,21 @@ def test_a_fault_that_names_a_stranger_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("[[drones]]\nid = 1\n[[drones]]\nid = 2\n", "the homes of drones 1 and 2 are 0 m apart"),
+        ("[search]\nnorth_m = 500\n", "its spiral goes 650 m from the origin"),
+        (
+            "[[drones]]\nid = 1\nhome_n_m = 700\n",
+            "the home of drone 1 lies outside limits.fence_radius_m = 600",
+        ),
+    ],
+)
+def test_homes_that_meet_and_places_beyond_the_fence_are_refused(text, says, tmp_path):
+    assert says in refused(tmp_path, text, SimMission)
+
+
+@pytest.mark.parametrize(
     "path", sorted(fleets.path("default").parent.glob("*.toml")), ids=lambda path: path.stem
 )
 def test_every_mission_that_ships_is_valid(path):
