@@ -31,6 +31,7 @@ class Telemetry:
         self._fleet_origin = origin
         self.heartbeat_utime: int | None = None
         self.battery = 0.0
+        self._is_armed_known = False
         self.is_known = False  # heard enough to speak for the vehicle: armed, and what the battery holds
         self.text = ""  # the last warning that the autopilot sent, for people
         self.forget()
@@ -83,11 +84,14 @@ class Telemetry:
             if is_new:
                 self.forget()
             self.mode = int(message.custom_mode)
+            self._is_armed_known = True
             self.armed = bool(message.base_mode & mavlink.MAV_MODE_FLAG_SAFETY_ARMED)
         elif kind in ("LOCAL_POSITION_NED", "ATTITUDE"):
             is_new = message.time_boot_ms + CLOCK_SLACK_MS < self._boot_ms
             if is_new:
+                # Whether it is armed only its next HEARTBEAT tells: till then nobody may take it for landed.
                 self.forget()
+                self.is_known = self._is_armed_known = False
             self._boot_ms = message.time_boot_ms
             if kind == "ATTITUDE":
                 self.roll_rad, self.pitch_rad, self.yaw_rad = message.roll, message.pitch, message.yaw
@@ -100,7 +104,7 @@ class Telemetry:
         elif kind == "GPS_GLOBAL_ORIGIN":
             self._set_origin(message.latitude * 1e-7, message.longitude * 1e-7)
         elif kind == "SYS_STATUS":
-            self.is_known = self.heartbeat_utime is not None
+            self.is_known = self._is_armed_known
             if message.battery_remaining >= 0:
                 self.battery = message.battery_remaining / 100
         elif kind == "STATUSTEXT" and message.severity <= mavlink.MAV_SEVERITY_WARNING:

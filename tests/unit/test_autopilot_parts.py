@@ -219,6 +219,27 @@ def test_a_jump_back_of_the_boot_time_is_a_restart():
     assert heard == [False, False, False, True, False]
 
 
+def test_after_a_jump_of_the_boot_time_nobody_is_told_of_a_landing_before_the_next_heartbeat():
+    telemetry, sender, flags = Telemetry(OriginSettings()), Codec(1, 1), mavlink.MAV_MODE_FLAG_SAFETY_ARMED
+
+    def beat() -> None:
+        sender.send.heartbeat_send(
+            mavlink.MAV_TYPE_QUADROTOR, 3, flags, Mode.GUIDED, mavlink.MAV_STATE_ACTIVE
+        )
+
+    def status() -> None:
+        sender.send.sys_status_send(0, 0, 0, 0, 12000, -1, 80, 0, 0, 0, 0, 0, 0)
+
+    told = []
+    for boot_ms, speak in ((9000, beat), (9050, status), (7000, status), (9100, beat), (9150, status)):
+        speak()
+        sender.send.local_position_ned_send(boot_ms, 1.0, 2.0, -30.0, 0.0, 0.0, 0.0)
+        for message in Codec(255, 190).parse(sender.take()):
+            telemetry.hear(message, 1)
+        told.append((telemetry.is_known, telemetry.landed))
+    assert told == [(False, False), (True, False), (False, True), (False, False), (True, False)]
+
+
 @given(st.lists(st.binary(max_size=80), max_size=8), st.randoms(use_true_random=False))
 @settings(deadline=None, max_examples=100)
 def test_damaged_bytes_raise_nothing_and_change_nothing(noise: list[bytes], chance: random.Random):

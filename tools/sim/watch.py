@@ -1,6 +1,5 @@
 """Looks on while a fleet flies: who is in which state, what is due to fail, when the mission is over."""
 
-from collections.abc import Iterable
 from typing import Protocol
 
 from lcmtypes import channels
@@ -95,10 +94,6 @@ class Watch:
         self.deaths[drone_id] = self.now_s
         self._living.discard(drone_id)
         self.states.pop(drone_id, None)
-
-    def living(self) -> Iterable[int]:
-        """Drones that have not died."""
-        return sorted(self._living)
 
 
 class _Marked:
