@@ -262,6 +262,8 @@ class Registrar:
         consensus = complete and all(look.node is not None and look.node.result.consensus for look in looks)
         if complete and len(looks) == 2:
             consensus = consensus and self._same_matching(looks[0], looks[1])
+        # A pod that nobody saw, as when it has dived, is nothing to agree on: all would stand by for ever.
+        consensus = consensus and result is not None and any(one.hits for one in result.map)
         self.finished = Finished(
             proposal.number,
             proposal.proposer,

@@ -257,9 +257,9 @@ def test_of_a_pair_the_one_without_a_frame_near_the_instant_claims_no_consensus(
     fleet.run(2.0)
     fleet.propose(1)
     seen = fleet.registrars[2].carrier.nearest
-    fleet.registrars[2].carrier.nearest = lambda _utime, _within: None  # type: ignore[method-assign]
+    fleet.registrars[2].carrier.nearest = lambda _utime, _within: None
     fleet.run(9.0)
-    fleet.registrars[2].carrier.nearest = seen  # type: ignore[method-assign]
+    fleet.registrars[2].carrier.nearest = seen
     assert not fleet.finished(2).consensus
 
 
@@ -299,3 +299,14 @@ def test_nobody_on_the_ground_is_asked_to_an_episode():
     state = make(fleet_state_t, members=0b101111, n_rows=len(rows), rows=rows)  # 5 is lost, 6 has no row yet
     assert able_members(state, (1, 2, 3, 4, 5, 6), own_id=2) == (2, 3, 6)
     assert able_members(state, (1, 2, 3, 4, 5, 6), own_id=1) == (1, 2, 3, 6)
+
+
+@pytest.mark.parametrize("n", [1, 3])
+def test_an_episode_over_a_pod_that_has_dived_agrees_on_nothing(n):
+    fleet = Fleet(n)
+    fleet.animals = np.zeros((0, 2))
+    fleet.boxes = lambda _drone_id: np.zeros((0, 4))
+    fleet.run(1.0)
+    fleet.propose(1)
+    fleet.run(7.0)
+    assert all(fleet.finished(k).complete and not fleet.finished(k).consensus for k in fleet.ids)
