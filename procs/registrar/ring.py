@@ -254,6 +254,10 @@ class RingNode:
         self, header: MapHeader, animals: list[MapAnimal], opens_lap: bool, now_s: float
     ) -> tuple[MapHeader, list[MapAnimal]]:
         """Match own boxes to the map and put this drone's word on it in place of its earlier word."""
+        view = self._observer.view
+        if view is not None and not animals:
+            # Those before saw nothing and may be far away: the map begins here, and reaches what is seen.
+            header = replace(header, origin_n_m=round(view.n_m), origin_e_m=round(view.e_m))
         before, was_fused = self._sight, self._fused
         if not {*before.ids.values()} <= {one.id for one in animals}:
             before = Sight()  # taken for lost and passed over: this map does not hold the earlier word

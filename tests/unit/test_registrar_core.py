@@ -310,3 +310,16 @@ def test_an_episode_over_a_pod_that_has_dived_agrees_on_nothing(n):
     fleet.propose(1)
     fleet.run(7.0)
     assert all(fleet.finished(k).complete and not fleet.finished(k).consensus for k in fleet.ids)
+
+
+def test_a_drone_far_from_the_pod_that_begins_the_map_keeps_nobody_from_agreeing():
+    fleet = Fleet(3)
+    fleet.poses[1] = Pose(-400.0, 0.0, -HEIGHT_M)  # farther than a map reaches
+    registrar = fleet.registrars[1]
+    see = registrar.detected
+    registrar.detected = lambda utime, boxes, *rest: see(utime, np.zeros((0, 4)), *rest)
+    fleet.run(1.0)
+    fleet.propose(2)
+    fleet.run(9.0)
+    assert all(fleet.finished(k).consensus for k in fleet.ids)
+    assert len(fleet.registrars[1].map.entries) == len(POD)
