@@ -12,6 +12,7 @@ BRAKING_M_S2 = 1.25  # that may be counted on to stop before a limit or over a g
 ACCELERATION_M_S2 = 2.5
 VERTICAL_ACCELERATION_M_S2 = 1.0
 APPROACH_1_S = 1.0  # near a goal or a limit the speed falls with the distance
+LED_BACK_M_S = 0.5  # over the fence
 LEASH_M = 5.0  # the followed point never runs farther ahead of the vehicle than this
 
 
@@ -36,16 +37,19 @@ class Envelope:
     def velocity(self, place: Vector, velocity: Vector) -> Vector:
         """`speed`, without what would lead from `place` over a limit: it falls to nothing on the way there.
 
-        Outside the limits only what leads further out is taken away, so that a vehicle can always come back.
+        Outside the limits what leads further out is taken away, so that a vehicle can always come back.
+        Over the fence it is led back gently: a flight along the fence would drift out step by step.
         """
         limits = self.limits
         vn, ve, vd = self.speed(velocity)
         away_m = math.hypot(place[0], place[1])
         if away_m > 0:
             outward = (vn * place[0] + ve * place[1]) / away_m
-            surplus = outward - approach_speed(limits.fence_radius_m - away_m)
+            surplus = outward - _outward_allowed(limits.fence_radius_m - away_m)
             if surplus > 0:
-                vn, ve = vn - surplus * place[0] / away_m, ve - surplus * place[1] / away_m
+                vn, ve = shorten(
+                    vn - surplus * place[0] / away_m, ve - surplus * place[1] / away_m, limits.speed_m_s
+                )
         height_m = -place[2]
         vd = max(vd, -approach_speed(limits.max_height_m - height_m))
         return vn, ve, min(vd, approach_speed(height_m - limits.min_height_m)) if vd > 0 else vd
@@ -84,6 +88,11 @@ class Follower:
         ahead_n, ahead_e = shorten(n - vehicle[0], e - vehicle[1], LEASH_M)
         ahead_d = min(max(d - vehicle[2], -LEASH_M), LEASH_M)
         self.place = vehicle[0] + ahead_n, vehicle[1] + ahead_e, vehicle[2] + ahead_d
+
+
+def _outward_allowed(inside_m: float) -> float:
+    """Most speed away from the origin `inside_m` before the fence; negative beyond it, but slow."""
+    return approach_speed(inside_m) if inside_m > 0 else max(APPROACH_1_S * inside_m, -LED_BACK_M_S)
 
 
 def approach_speed(distance_m: float) -> float:

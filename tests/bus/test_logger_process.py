@@ -18,6 +18,7 @@ from procs.settings import DroneSettings, Mission
 
 ROOT = Path(__file__).parents[2]
 DEADLINE_S = 30.0
+LATE_US = 500_000  # what a busy machine may run a timer late
 PERIOD_MS = 10
 
 
@@ -86,7 +87,7 @@ def test_a_killed_logger_leaves_a_log_up_to_its_last_second_and_its_successor_go
     with pytest.warns(match="was not closed"):
         logged = [message.seq for _, _, message in read(drone.log, channels=channels.VEHICLE_STATE)]
     assert logged == list(range(logged[0], logged[-1] + 1))
-    assert drone.said[logged[-1]] >= killed_utime - 1_000_000
+    assert drone.said[logged[-1]] >= killed_utime - 1_000_000 - LATE_US
     assert drone.said[logged[0]] <= drone.states[0].utime - 900_000
 
     first_log = drone.log.read_bytes()

@@ -22,6 +22,7 @@ from procs.settings import DriverSpec, DroneSettings, Mission
 
 RATE = 10.0
 DEADLINE_S = 20.0
+QUIET_MS = 300
 PROCESS = "navigator"
 
 
@@ -71,7 +72,7 @@ class BusBench:
             signal.set_wakeup_fd(-1)
             for number, handler in kept.items():
                 signal.signal(number, handler)
-        while self._others.handle_timeout(0) > 0:
+        while self._others.handle_timeout(QUIET_MS) > 0:  # the last words may still be on their way
             pass
         return self._said
 
