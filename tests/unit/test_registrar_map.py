@@ -122,8 +122,8 @@ def test_what_does_not_fit_is_refused_with_its_value(animal, message):
 
 
 def test_a_map_too_large_or_too_far_is_refused():
-    with pytest.raises(ValueError, match="41 animals"):
-        encode_map(HEADER, [whale(k) for k in range(41)])
+    with pytest.raises(ValueError, match="33 animals"):
+        encode_map(HEADER, [whale(k) for k in range(33)])
     with pytest.raises(ValueError, match="32767 m"):
         encode_map(MapHeader(7, 2, 1, 0, 0, 1.0, 40000, 0, 0.0), [])
 

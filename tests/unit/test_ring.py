@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from procs.registrar.box_icp import BoxAlignment, align_marks
-from procs.registrar.map import HEADER_BYTES, MapAnimal, Memory
+from procs.registrar.map import HEADER_BYTES, MAX_ANIMALS, MapAnimal, Memory
 from procs.registrar.ring import RingNode, ViewGeometry, register_ring
 from tools.bench_registration import CAMERA, IMAGE_SIZE, Cell, draw_views, is_ring_right
 
@@ -327,7 +327,7 @@ def test_more_boxes_than_a_packet_holds_is_no_error():
     corners = rng.uniform(0, 900, (60, 2))
     boxes = np.concatenate([corners, corners + rng.uniform(10, 40, (60, 2))], axis=1)
     answer = register_ring([boxes], image_size=IMAGE_SIZE)
-    assert (answer.identities[0] >= 0).sum() == 40
+    assert (answer.identities[0] >= 0).sum() == MAX_ANIMALS
 
 
 def test_a_member_that_was_passed_over_while_it_lived_says_its_word_anew():

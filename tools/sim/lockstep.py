@@ -96,7 +96,7 @@ class LockstepFleet:
         bus.observers.append(partial(observe, drone_id))
         settings = DroneSettings(
             drone_id=drone_id,
-            mission=self.plan.mission,
+            mission=self.plan.plain_mission,
             seed=self.plan.mission.seed,
             run_dir=str(self.plan.folder),
             log_path=str(self.plan.log_path(drone_id)),

@@ -10,6 +10,7 @@ from drivers.sim.world import WorldSettings
 from lcmtypes.podwatch import world_animal_t
 from procs.history import camera_of
 from procs.queue_executor import ClockError
+from procs.settings import Mission
 from tools.sim.settings import SimMission
 from tools.sim.truth import labelled_animals
 
@@ -33,6 +34,11 @@ class RunPlan:
     @property
     def camera(self) -> Pinhole:
         return camera_of(self.mission.camera)
+
+    @property
+    def plain_mission(self) -> Mission:
+        """What the drones are told: the mission without the world, its faults and expectations."""
+        return Mission.model_validate(self.mission.model_dump(include=set(Mission.model_fields)))
 
     @property
     def centre_ne(self) -> tuple[float, float]:

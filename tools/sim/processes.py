@@ -59,6 +59,7 @@ class ProcessFleet:
         self._write_settings()
         self.supervisor = Supervisor(plan.folder, roster, self._slot.fileno())
         self._next_check = 0.0
+        self._in_flight = False
 
     def __enter__(self) -> "ProcessFleet":
         return self
@@ -85,6 +86,7 @@ class ProcessFleet:
             if missing == ["world"]:  # again and again, as the world may not listen yet
                 self._command(kind="go")
             self.look()
+        self._in_flight = True
 
     def look(self) -> None:
         """Hear what waits on the buses; now and then see whether the tree still stands."""
@@ -94,7 +96,7 @@ class ProcessFleet:
                 pass
         if time.monotonic() >= self._next_check:
             self._next_check = time.monotonic() + CHECK_EVERY_S
-            self.supervisor.check()
+            self.supervisor.check(in_flight=self._in_flight)
 
     def close(self) -> None:
         """Stop all in order; leave nothing in shared memory."""

@@ -142,8 +142,12 @@ class Supervisor:
         """Program -> (supervisord's word for its state, pid); empty while supervisord does not answer yet."""
         return {row["name"]: (row["statename"], row["pid"]) for row in self._rows()}
 
-    def check(self) -> None:
-        """Raise SupervisorError where supervisord has died, or a process cannot start."""
+    def check(self, *, in_flight: bool = False) -> None:
+        """Raise SupervisorError where supervisord has died, or a process cannot start.
+
+        in_flight: every process has run; one that cannot start now (a port, a device not free again yet)
+        is tried again and again, since a drone in the air is better off with it.
+        """
         if not self.is_alive:
             raise SupervisorError(f"supervisord ended with code {self._popen.returncode}; see {self._output}")
         for row in self._rows():
@@ -151,6 +155,15 @@ class Supervisor:
             # What was killed is EXITED too, for the moment until it is started again. What says that it
             # cannot start is not tried five times.
             cannot = state in ("EXITED", "BACKOFF", "FATAL") and row["exitstatus"] == EXIT_CANNOT_START
+            if in_flight and name != WORLD and (state == "FATAL" or (cannot and state == "EXITED")):
+                with (
+                    contextlib.suppress(Fault),
+                    _proxy(self._socket) as proxy,
+                ):  # Fault: it runs again
+                    proxy.supervisor.startProcess(f"{row['group']}:{name}", False)
+                continue
+            if in_flight and name != WORLD:
+                continue
             if cannot or state == "FATAL" or (state == "EXITED" and name == WORLD):
                 output = (self._output / f"{name}.txt").read_text(errors="replace").strip()
                 last = output.splitlines()[-1] if output else "it said nothing"
