@@ -11,9 +11,11 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from typer.testing import CliRunner
 
 from drivers.cameras.pinhole import apply_homography
 from procs.detector.yolo import Detections, Detector
+from tools.cli import app
 from tools.detector_data import (
     Sample,
     augment,
@@ -242,6 +244,17 @@ def test_a_killed_run_goes_on_and_ends_like_one_that_was_not_killed(tmp_path: Pa
     assert Detector(resumed).input_size == (64, 64)
     with pytest.raises(ValueError, match="differs from torch"):
         check_export(WhaleDetector(), resumed, TINY.side)
+
+
+@pytest.mark.timeout(240)
+def test_the_smoke_run_of_the_command_line_leaves_a_model_that_loads(tmp_path: Path) -> None:
+    words = ["train", "detector", "--smoke", "--out", str(tmp_path / "run")]
+    result = CliRunner().invoke(app, words)
+    assert result.exit_code == 0, result.output
+    assert "at most" in result.output, "the export was held against torch"
+    model = Detector(tmp_path / "run" / "smoke" / "detector.onnx")
+    assert model.input_size == (Settings.side, Settings.side)
+    assert model.detect(np.zeros((480, 640, 3), np.uint8)).boxes.shape[1] == 4
 
 
 def test_own_pictures_are_read_from_a_yolo_data_file(data_set: Path, tmp_path: Path) -> None:
