@@ -310,7 +310,7 @@ def hold(now: Situation, memory: Memory, camera: Pinhole) -> Step:
     is good.
     """
     vehicle = now.inputs.vehicle
-    if vehicle is not None and not vehicle.guided and now.vehicle_fresh:
+    if vehicle is not None and not vehicle.guided and now.told:
         memory.held_us = memory.pilot_us = now.utime
         memory.hold_ned = None
         return Step(goal=now.position, kind=podwatch.setpoint_t.IDLE)

@@ -16,7 +16,7 @@ _GOING_HOME = (State.RETURN, State.LAND, State.LANDED)
 def pilot_has_it(now: Situation) -> bool:
     """In the air and not guided: the pilot, a ground station or a failsafe of the autopilot flies."""
     vehicle = now.inputs.vehicle
-    return vehicle is not None and now.vehicle_fresh and not vehicle.guided and not vehicle.landed
+    return vehicle is not None and now.told and not vehicle.guided and not vehicle.landed
 
 
 def overriding_events(now: Situation, memory: Memory) -> list[Event]:
@@ -25,14 +25,13 @@ def overriding_events(now: Situation, memory: Memory) -> list[Event]:
     """
     operator = podwatch.operator_t
     vehicle, limits = now.inputs.vehicle, now.mission.limits
-    told = vehicle is not None and now.vehicle_fresh and now.link_ok
-    down = vehicle is not None and told and vehicle.landed and not vehicle.armed
+    down = vehicle is not None and now.told and vehicle.landed and not vehicle.armed
     if down and memory.state in (State.RETURN, State.LAND, State.HOLD):
         return [Event.TOUCHED_DOWN]
     if pilot_has_it(now):
         return [Event.PILOT]  # the pilot's stick always wins: no order, no battery moves the drone
     events = []
-    if vehicle is not None and told and vehicle.battery < limits.battery_land:
+    if vehicle is not None and now.told and vehicle.battery < limits.battery_land:
         events.append(Event.BATTERY_EMPTY)
     if now.command == operator.LAND:
         events.append(Event.ORDER_LAND)

@@ -108,8 +108,7 @@ class Navigator:
 
     def _begin(self, now: Situation) -> bool:
         """Find out whether the drone is in flight already; False while that is not known."""
-        vehicle = now.inputs.vehicle
-        if vehicle is None or not now.vehicle_fresh or not now.link_ok:
+        if not now.told:
             return False
         waited_s = now.seconds_since(self._begun_us)
         if now.own_row is None and waited_s < resume.LISTEN_S:

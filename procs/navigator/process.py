@@ -30,6 +30,7 @@ def setup(runtime: Runtime) -> None:
     def remember(name: str, message: Any) -> None:
         newest[name] = message
         if name == "vehicle":
+            newest["vehicle_heard_us"] = runtime.utime
             navigator.hear_vehicle(message)
 
     def listen(name: str, channel: str) -> None:

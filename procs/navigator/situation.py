@@ -27,7 +27,11 @@ LINK_LIMIT_S = 2.0  # the autopilot's own heartbeat comes at 1 Hz
 
 @dataclass(frozen=True)
 class Inputs:
-    """The newest of everything at `utime` (us, drone clock); None where nothing was heard yet."""
+    """The newest of everything at `utime` (us, drone clock); None where nothing was heard yet.
+
+    vehicle_heard_us: when `vehicle` was heard; its own utime is its position's, which may be lost while the
+    rest of it is new. 0: taken for as old as its position.
+    """
 
     utime: int
     vehicle: podwatch.vehicle_state_t | None = None
@@ -36,6 +40,7 @@ class Inputs:
     assignment: podwatch.assignment_t | None = None
     track: podwatch.track_t | None = None
     fleet: podwatch.fleet_state_t | None = None
+    vehicle_heard_us: int = 0
 
 
 @dataclass(frozen=True)
@@ -151,6 +156,15 @@ class Situation:
         """The bridge hears the autopilot: else what it says of the vehicle is old, or defaults."""
         vehicle = self.inputs.vehicle
         return vehicle is not None and vehicle.link_age_ms <= LINK_LIMIT_S * 1e3
+
+    @property
+    def told(self) -> bool:
+        """The autopilot tells of itself now: armed, landed, mode and battery hold, whether or not it has a
+        position.
+        """
+        vehicle = self.inputs.vehicle
+        heard_us = 0 if vehicle is None else self.inputs.vehicle_heard_us or vehicle.utime
+        return vehicle is not None and self.link_ok and self.seconds_since(heard_us) <= VEHICLE_LIMIT_S
 
     @property
     def vehicle_ok(self) -> bool:

@@ -1,5 +1,7 @@
 """A navigator that starts while the bridge has not heard the autopilot yet: both were killed in flight."""
 
+from dataclasses import replace
+
 import pytest
 
 from drivers.autopilots.ardupilot import mavlink
@@ -84,3 +86,45 @@ def test_in_doubt_whether_the_autopilot_is_heard_no_drone_has_touched_down():
             states.append(outputs.mission.state)
     assert State.LANDED not in states
     assert State.LAND not in states
+
+
+def position_lost(utime: int, **members: float | bool) -> Inputs:
+    """The position stopped 10 s ago; the autopilot still tells of itself."""
+    state = {"d_m": -30.0, "armed": True, "guided": True, "battery": 0.9} | members
+    message = make(podwatch.vehicle_state_t, utime=utime - 10 * S, position_ok=False, **state)
+    return Inputs(utime=utime, vehicle=message, vehicle_heard_us=utime)
+
+
+def held_in_flight(last: State = State.SCOUT) -> Navigator:
+    """A navigator that was restarted in flight a moment ago, without a position."""
+    row = make(podwatch.fleet_row_t, id=2, alive=True, state=last, animal=-1)
+    fleet = make(podwatch.fleet_state_t, utime=100 * S, n_rows=1, rows=[row], members=2)
+    navigator = Navigator(Mission(), 2)
+    navigator.update(replace(position_lost(100 * S), fleet=fleet))
+    assert navigator.state == State.HOLD
+    return navigator
+
+
+def test_without_a_position_an_empty_battery_still_brings_it_down_and_the_ground_ends_the_flight():
+    navigator = held_in_flight()
+    navigator.update(position_lost(101 * S))
+    assert navigator.state == State.HOLD
+    outputs = navigator.update(position_lost(102 * S, battery=0.05))
+    assert navigator.state == State.LAND
+    outputs = navigator.update(position_lost(103 * S, battery=0.05))
+    assert outputs.setpoint.kind == podwatch.setpoint_t.LAND
+    navigator.update(position_lost(104 * S, armed=False, landed=True))
+    assert navigator.state == State.LANDED
+
+
+def test_without_a_position_the_pilot_still_wins():
+    navigator = held_in_flight()
+    outputs = navigator.update(position_lost(101 * S, guided=False, battery=0.05))
+    assert (navigator.state, outputs.setpoint.kind) == (State.HOLD, podwatch.setpoint_t.IDLE)
+
+
+def test_what_the_bridge_said_before_it_fell_silent_counts_no_more():
+    navigator = held_in_flight()
+    old = position_lost(101 * S, armed=False, landed=True, battery=0.05)
+    navigator.update(replace(old, utime=103 * S))
+    assert navigator.state == State.HOLD
