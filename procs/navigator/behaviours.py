@@ -185,8 +185,9 @@ def _keep_station(now: Situation, memory: Memory, camera: Pinhole) -> Step:
     """Fly to the place on the circle or hold it; says whether this drone is on station (level, slow and
     near).
     """
+    stuck = Event.STUCK if now.seconds_since(memory.gather_since_us) > GATHER_LIMIT_S else None
     if memory.find is None:
-        return Step(goal=now.position, velocity=np.zeros(3))
+        return Step(goal=now.position, velocity=np.zeros(3), event=stuck)
     goal = inside_fence(station(now, memory.find, camera), now.mission.limits)
     step = fly_to(now, goal, now.mission.watch.speed_m_s, feed_ne=memory.find.drift_ne)
     error_m = float(np.linalg.norm(goal - now.position))
@@ -204,8 +205,7 @@ def _keep_station(now: Situation, memory: Memory, camera: Pinhole) -> Step:
         memory.station_since_us = now.utime
     # Once on station a gust may tilt it for a moment: it stays on station while it is near.
     step.on_station = memory.station_since_us > 0
-    if now.seconds_since(memory.gather_since_us) > GATHER_LIMIT_S:
-        step.event = Event.STUCK
+    step.event = stuck
     return step
 
 

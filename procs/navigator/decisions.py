@@ -13,6 +13,12 @@ WATCH_MARGIN_S = 2.0
 _GOING_HOME = (State.RETURN, State.LAND, State.LANDED)
 
 
+def in_air(now: Situation) -> bool:
+    """The autopilot says now that it is armed and not on the ground."""
+    vehicle = now.inputs.vehicle
+    return vehicle is not None and now.told and vehicle.armed and not vehicle.landed
+
+
 def pilot_has_it(now: Situation) -> bool:
     """In the air and not guided: the pilot, a ground station or a failsafe of the autopilot flies."""
     vehicle = now.inputs.vehicle
@@ -28,6 +34,8 @@ def overriding_events(now: Situation, memory: Memory) -> list[Event]:
     down = vehicle is not None and now.told and vehicle.landed and not vehicle.armed
     if down and memory.state in (State.RETURN, State.LAND, State.HOLD):
         return [Event.TOUCHED_DOWN]
+    if memory.state == State.LANDED and in_air(now):
+        return [Event.AIRBORNE]  # who flies it and on what charge is then HOLD's to judge
     if pilot_has_it(now):
         return [Event.PILOT]  # the pilot's stick always wins: no order, no battery moves the drone
     events = []

@@ -4,6 +4,7 @@ holds first).
 
 import numpy as np
 
+from procs.navigator.decisions import in_air, pilot_has_it
 from procs.navigator.situation import Find, Memory, Situation
 from procs.navigator.states import Event, State
 
@@ -38,15 +39,16 @@ def take_up(now: Situation, memory: Memory) -> Event | None:
     None on the ground before the mission: IDLE. The animal is kept when the tracker, the map or the
     certificate knows it.
     """
-    row, vehicle = now.own_row, now.inputs.vehicle
-    in_air = vehicle is not None and vehicle.armed and not vehicle.landed
+    row = now.own_row
     last = State.IDLE if row is None else State(row.state)
     if row is not None:
         memory.waypoint = max(row.waypoint, 0)
-    if not in_air:
+    if not in_air(now):
         home = (State.RETURN, State.LAND, State.LANDED)
         return Event.ALREADY_HOME if last in home else None
     memory.resumed = True
+    if last == State.LAND and not pilot_has_it(now):
+        return Event.LANDS_ON  # a HOLD would climb it back to the lowest height that it may fly at
     memory.resume = _EVENT.get(last, Event.TO_STANDBY)
     if row is not None and row.found and last not in (State.RETURN, State.LAND, State.LANDED):
         memory.find = Find(np.array([row.found_n_m, row.found_e_m], dtype=np.float64), row.pod_radius_m)

@@ -33,6 +33,7 @@ class Event(Enum):
 
     START = "the mission begins"
     IN_AIR = "started in flight"
+    LANDS_ON = "started while it came down"
     ALREADY_HOME = "landed before this start"
     AT_HEIGHT = "at height"
     NOT_CLIMBING = "take-off did not happen"
@@ -58,6 +59,7 @@ class Event(Enum):
     FLEET_RETURNS = "the fleet returns"
     STUCK = "no agreement in the time that a fleet may hover"
     HOME = "over its home"
+    AIRBORNE = "in the air after all"
     TOUCHED_DOWN = "on the ground, disarmed"
     DOUBT = "position or autopilot in doubt"
     PILOT = "the pilot has it"
@@ -96,6 +98,7 @@ class Rule:
 RULES = (
     Rule((S.IDLE, S.LANDED), E.START, S.TAKEOFF),
     Rule((S.IDLE,), E.IN_AIR, S.HOLD),
+    Rule((S.IDLE,), E.LANDS_ON, S.LAND),
     Rule((S.IDLE,), E.ALREADY_HOME, S.LANDED),
     Rule((S.TAKEOFF,), E.AT_HEIGHT, S.STANDBY),
     Rule((S.TAKEOFF,), E.NOT_CLIMBING, S.IDLE),
@@ -124,6 +127,7 @@ RULES = (
     Rule((S.RETURN,), E.HOME, S.LAND),
     Rule((S.LAND,), E.TOUCHED_DOWN, S.LANDED),
     Rule((S.RETURN, S.HOLD), E.TOUCHED_DOWN, S.LANDED),
+    Rule((S.LANDED,), E.AIRBORNE, S.HOLD),
     Rule(FLYING, E.DOUBT, S.HOLD),
     Rule(FLYING, E.PILOT, S.HOLD),
     Rule(FLYING, E.ORDER_HOLD, S.HOLD),

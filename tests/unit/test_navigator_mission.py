@@ -7,7 +7,7 @@ import pytest
 
 from lcmtypes import make, podwatch
 from procs.navigator.mission import Navigator
-from procs.navigator.states import State
+from procs.navigator.states import Event, State
 from tests.unit.navigator_flights import Drone, Fleet, mission
 
 POD = np.array([[92.0, -8.0], [104.0, 3.0], [96.0, 12.0], [110.0, -6.0], [101.0, -15.0]])
@@ -312,3 +312,18 @@ def test_every_setpoint_keeps_the_limits_and_expires() -> None:
 def test_a_drone_outside_the_roster_is_refused() -> None:
     with pytest.raises(KeyError, match="drone 9 is not in the roster"):
         Navigator(mission(2), 9)
+
+
+def test_a_drone_that_gathers_without_a_find_does_not_wait_for_ever() -> None:
+    fleet = Fleet(mission(1), POD)
+    fleet.run(120.0, lambda: fleet.all_in(State.RENDEZVOUS))
+    memory = fleet.drone(1).navigator.memory
+    fleet.visible = False
+    memory.find = None
+    memory.barycentre.reset()
+    fleet.run(5.0)
+    assert memory.state == State.RENDEZVOUS
+    assert memory.find is None
+    memory.gather_since_us = fleet.utime - 301_000_000
+    fleet.run(0.3)
+    assert (memory.state, memory.reason) == (State.RETURN, Event.STUCK.value)

@@ -128,3 +128,57 @@ def test_what_the_bridge_said_before_it_fell_silent_counts_no_more():
     old = position_lost(101 * S, armed=False, landed=True, battery=0.05)
     navigator.update(replace(old, utime=103 * S))
     assert navigator.state == State.HOLD
+
+
+def flying_low(utime: int, **members: float | bool) -> Inputs:
+    """Low over the sea, on its way down; `members` say otherwise."""
+    state = {"d_m": -4.0, "armed": True, "guided": True, "position_ok": True, "battery": 0.9} | members
+    row = make(podwatch.fleet_row_t, id=2, alive=True, state=State.LAND, animal=-1)
+    fleet = make(podwatch.fleet_state_t, utime=utime, n_rows=1, rows=[row], members=2)
+    return Inputs(utime=utime, vehicle=make(podwatch.vehicle_state_t, utime=utime, **state), fleet=fleet)
+
+
+def test_a_drone_that_was_coming_down_lands_on_at_once():
+    navigator = Navigator(Mission(), 2)
+    for tick in range(10):
+        outputs = navigator.update(flying_low(100 * S + tick * S // 10))
+        assert outputs.mission is not None
+        assert (outputs.mission.state, outputs.setpoint.kind) == (State.LAND, podwatch.setpoint_t.LAND)
+
+
+def test_a_drone_that_was_coming_down_and_that_the_pilot_has_meanwhile_is_the_pilots():
+    navigator = Navigator(Mission(), 2)
+    outputs = navigator.update(flying_low(100 * S, guided=False))
+    assert (navigator.state, outputs.setpoint.kind) == (State.HOLD, podwatch.setpoint_t.IDLE)
+
+
+def landed() -> Navigator:
+    navigator = Navigator(Mission(), 2)
+    navigator.update(flying_low(100 * S, armed=False, landed=True))
+    assert navigator.state == State.LANDED
+    return navigator
+
+
+def test_a_landed_drone_that_is_in_the_air_after_all_holds_and_lands_on():
+    navigator = landed()
+    for tick in range(30):
+        navigator.update(flying_low(101 * S + tick * S // 10))
+        assert navigator.state == (State.HOLD if tick <= 20 else State.LAND)
+
+
+def test_a_landed_drone_in_the_air_is_the_pilots_while_he_flies_and_lands_on_an_empty_battery():
+    navigator = landed()
+    for tick in range(60):
+        outputs = navigator.update(flying_low(101 * S + tick * S // 10, guided=False, battery=0.05))
+    assert (navigator.state, outputs.setpoint.kind) == (State.HOLD, podwatch.setpoint_t.IDLE)
+    navigator.update(flying_low(108 * S, battery=0.05))
+    assert navigator.state == State.LAND
+
+
+@pytest.mark.parametrize(
+    "members", [{"armed": False, "landed": True}, {"landed": True}, {"link_age_ms": NEVER_MS}]
+)
+def test_a_landed_drone_stays_so_on_the_ground_and_without_a_word_of_the_autopilot(members):
+    navigator = landed()
+    navigator.update(flying_low(101 * S, **members))
+    assert navigator.state == State.LANDED
