@@ -4,12 +4,13 @@ watch.
 
 from lcmtypes import podwatch
 from procs.navigator.situation import Memory, Situation
-from procs.navigator.states import Event, State
+from procs.navigator.states import GATHERED, Event, State
 
 __all__ = ["overriding_events", "pilot_has_it"]
 
 # So that every drone's watch covers what was asked, though their clocks start a second apart.
 WATCH_MARGIN_S = 2.0
+BLIND_LIMIT_S = 10.0  # longer than the detector takes to start again
 _GOING_HOME = (State.RETURN, State.LAND, State.LANDED)
 
 
@@ -54,6 +55,8 @@ def overriding_events(now: Situation, memory: Memory) -> list[Event]:
         events.append(Event.ORDER_RETURN)
     if now.command == operator.HOLD:
         events.append(Event.ORDER_HOLD)
+    if _is_blind(now, memory):
+        events.append(Event.BLIND)
     if memory.watch_since_us and (
         now.seconds_since(memory.watch_since_us) > now.mission.watch.watch_s + WATCH_MARGIN_S
     ):
@@ -63,10 +66,24 @@ def overriding_events(now: Situation, memory: Memory) -> list[Event]:
     return events
 
 
+def _is_blind(now: Situation, memory: Memory) -> bool:
+    """Gathered, and for long not one frame was searched: a member without sight costs every episode its
+    consensus.
+
+    In MONITOR the tracker may go on without the detector; a camera that is silent loses it the animal, and so
+    brings it here.
+    """
+    if memory.state not in GATHERED:
+        return False
+    return now.seconds_since(max(memory.sight_us, memory.gather_since_us)) > BLIND_LIMIT_S
+
+
 def _fleet_returns(now: Situation, memory: Memory) -> bool:
     """All others go home, and not for want of charge: the watch is over, though this drone may not know
-    since when.
+    since when. While nobody has watched yet, they go for a reason of their own: blind, or ordered.
     """
+    if not (memory.watch_seen or memory.resumed):
+        return False
     if memory.find is None or not now.others or (memory.state == State.MONITOR and not memory.resumed):
         return False
     charged = [row for row in now.others if row.battery > now.mission.limits.battery_return + 0.02]

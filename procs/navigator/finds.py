@@ -26,6 +26,8 @@ LOOKING = (State.SCOUT, State.FOUND, State.RENDEZVOUS, State.REGISTER)
 def sense(now: Situation, memory: Memory, camera: Pinhole) -> None:
     """Feed the newest detections to the presence gate and to the barycentre."""
     detections = now.inputs.detections
+    if detections is not None:
+        memory.sight_us = max(memory.sight_us, detections.utime)
     if detections is None or memory.state not in LOOKING or detections.utime <= memory.detections_us:
         return
     memory.detections_us = detections.utime
@@ -123,6 +125,7 @@ def keep_clock(now: Situation, memory: Memory) -> None:
         if gathering:
             memory.watch_since_us = 0
         return
+    memory.watch_seen = True
     memory.first_watch_us = memory.first_watch_us or now.utime
     if memory.watch_since_us == 0 and (not gathering or now.seconds_since(memory.first_watch_us) > JOIN_S):
         memory.watch_since_us = now.utime

@@ -106,11 +106,13 @@ class Memory:
     conflict_since_us: int = 0
     strangers_since_us: int = 0  # since when MONITOR sees animals without names only, 0 while it does not
     n_conflicts: int = 0
+    sight_us: int = 0  # capture time of the newest detections heard in any state
     detections_us: int = 0  # capture time of the newest detections that were taken in
     first_watch_us: int = 0  # when the first drone was seen in MONITOR, 0 while none is
     watch_since_us: int = 0  # when the fleet began MONITOR, 0 before
     held_us: int = 0  # last instant of doubt
     pilot_us: int = 0  # last instant at which the pilot had it
+    watch_seen: bool = False  # it has seen the fleet watch, at any time
     resumed: bool = False  # started in flight: it does not know since when the fleet watches
     hold_ned: Array | None = None
     resume: Event = Event.TO_STANDBY

@@ -7,7 +7,7 @@ compares the two.
 from dataclasses import dataclass
 from enum import Enum, IntEnum
 
-__all__ = ["FLYING", "IN_CIRCLE", "RULES", "Event", "Rule", "State", "diagram", "next_state"]
+__all__ = ["FLYING", "GATHERED", "IN_CIRCLE", "RULES", "Event", "Rule", "State", "diagram", "next_state"]
 
 
 class State(IntEnum):
@@ -58,6 +58,7 @@ class Event(Enum):
     WATCHED = "watched for as long as asked"
     FLEET_RETURNS = "the fleet returns"
     STUCK = "no agreement in the time that a fleet may hover"
+    BLIND = "its camera or detector is silent"
     HOME = "over its home"
     AIRBORNE = "in the air after all"
     TOUCHED_DOWN = "on the ground, disarmed"
@@ -124,6 +125,7 @@ RULES = (
     Rule((S.STANDBY, *GATHERED, S.MONITOR), E.WATCHED, S.RETURN),
     Rule((S.STANDBY, *GATHERED, S.MONITOR), E.FLEET_RETURNS, S.RETURN),
     Rule(GATHERED, E.STUCK, S.RETURN),
+    Rule(GATHERED, E.BLIND, S.RETURN),
     Rule((S.RETURN,), E.HOME, S.LAND),
     Rule((S.LAND,), E.TOUCHED_DOWN, S.LANDED),
     Rule((S.RETURN, S.HOLD), E.TOUCHED_DOWN, S.LANDED),

@@ -29,15 +29,17 @@ from procs.runtime import Runtime
 
 STEP_S = 0.2
 UPKEEP_S = 1.0
-# A drone in one of these is on the ground or near it: it has no view, and one without a view keeps everybody
-# else from consensus.
-GROUNDED = (State.IDLE, State.TAKEOFF, State.LAND, State.LANDED)
+# A drone in one of these is on the ground, near it or on its way home: it has no view of the pod, and one
+# without a view keeps everybody else from consensus.
+AWAY = (State.IDLE, State.TAKEOFF, State.RETURN, State.LAND, State.LANDED)
 
 
 def able_members(state: fleet_state_t, roster: tuple[int, ...], own_id: int) -> tuple[int, ...]:
-    """Whom this drone asks to an episode: itself, and the living that are not on the ground."""
-    grounded = [row.id for row in state.rows if row.state in GROUNDED and row.id != own_id]
-    return tuple(member for member in from_bitmap(state.members, roster) if member not in grounded)
+    """Whom this drone asks to an episode: itself, and the living that are neither on the ground nor on their
+    way home.
+    """
+    away = [row.id for row in state.rows if row.state in AWAY and row.id != own_id]
+    return tuple(member for member in from_bitmap(state.members, roster) if member not in away)
 
 
 class RegistrarShell:

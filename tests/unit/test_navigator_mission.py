@@ -327,3 +327,36 @@ def test_a_drone_that_gathers_without_a_find_does_not_wait_for_ever() -> None:
     memory.gather_since_us = fleet.utime - 301_000_000
     fleet.run(0.3)
     assert (memory.state, memory.reason) == (State.RETURN, Event.STUCK.value)
+
+
+@pytest.mark.parametrize("state", [State.RENDEZVOUS, State.MONITOR])
+def test_a_drone_whose_detector_is_silent_goes_home_from_the_circle_and_the_other_goes_on(
+    state: State,
+) -> None:
+    fleet = Fleet(mission(2, watch={"watch_s": 200.0}), POD, DRIFT)
+    fleet.run(120.0, lambda: fleet.all_in(state))
+    fleet.agrees = state == State.MONITOR
+    detections = fleet._detections
+    fleet._detections = lambda drone: detections(drone) if drone.id == 1 else None
+    blind = fleet.drone(2).navigator.memory
+    fleet.run(9.5)
+    assert blind.state in ((State.MONITOR,) if state == State.MONITOR else (State.RENDEZVOUS, State.REGISTER))
+    fleet.run(2.0)
+    if state == State.MONITOR:
+        assert blind.state == State.MONITOR, "the tracker goes on"
+        return
+    assert (blind.state, blind.reason) == (State.RETURN, Event.BLIND.value)
+    fleet.agrees = True
+    fleet.run(30.0, lambda: fleet.drone(1).navigator.state == State.MONITOR)
+    assert fleet.drone(1).navigator.state == State.MONITOR, "that one went home does not end the watch"
+
+
+def test_a_silent_camera_loses_the_animal_and_then_brings_the_drone_home() -> None:
+    fleet = Fleet(mission(1, watch={"watch_s": 200.0}), POD[:1])
+    fleet.run(120.0, lambda: fleet.all_in(State.MONITOR))
+    said = fleet._identities()  # the last: without detections the registrar says nothing new
+    fleet._detections = fleet._track = lambda drone: None
+    fleet._identities = lambda: said
+    gone_s = fleet.run(80.0, lambda: fleet.all_in(State.RETURN))
+    assert 48.0 < gone_s < 54.0
+    assert fleet.drone(1).navigator.memory.reason == Event.BLIND.value

@@ -293,12 +293,16 @@ def test_a_member_whose_barometer_puts_it_below_the_ground_takes_part_without_a_
     assert all(fleet.finished(k).complete and not fleet.finished(k).consensus for k in fleet.ids)
 
 
-def test_nobody_on_the_ground_is_asked_to_an_episode():
+def test_nobody_on_the_ground_or_on_the_way_home_is_asked_to_an_episode():
     states = {1: State.LANDED, 2: State.REGISTER, 3: State.MONITOR, 4: State.TAKEOFF, 5: State.REGISTER}
+    states |= {7: State.RETURN, 8: State.HOLD}
     rows = [make(fleet_row_t, id=drone_id, alive=True, state=state) for drone_id, state in states.items()]
-    state = make(fleet_state_t, members=0b101111, n_rows=len(rows), rows=rows)  # 5 is lost, 6 has no row yet
-    assert able_members(state, (1, 2, 3, 4, 5, 6), own_id=2) == (2, 3, 6)
-    assert able_members(state, (1, 2, 3, 4, 5, 6), own_id=1) == (1, 2, 3, 6)
+    state = make(
+        fleet_state_t, members=0b11101111, n_rows=len(rows), rows=rows
+    )  # 5 is lost, 6 has no row yet
+    roster = tuple(range(1, 9))
+    assert able_members(state, roster, own_id=2) == (2, 3, 6, 8)
+    assert able_members(state, roster, own_id=1) == (1, 2, 3, 6, 8)
 
 
 @pytest.mark.parametrize("n", [1, 3])
