@@ -186,7 +186,7 @@ class DriverSpec(Section):
 
 
 class DroneSettings(Section):
-    """All that one drone's processes are told; `podwatch sim` and `podwatch fly` write it as JSON."""
+    """All that one drone's processes are told; `podwatch sim` writes it as JSON."""
 
     drone_id: int = Field(ge=1, le=99)
     mission: Mission
