@@ -11,7 +11,7 @@ from drivers.cameras.pinhole import Pinhole
 from lcmtypes import podwatch
 from procs.navigator.flight import approach, inside_fence
 from procs.navigator.formation import circle_radius, gather_height, slot
-from procs.navigator.situation import Find, Memory, Situation, Step, episode_key
+from procs.navigator.situation import WAITS, Find, Memory, Situation, Step, episode_key
 from procs.navigator.spiral import spacing_for, spiral
 from procs.navigator.states import Event, State
 
@@ -35,19 +35,23 @@ ASSIGN_LIMIT_S = 15.0
 GATHER_LIMIT_S = 300.0
 HOLD_LIMIT_S = 15.0
 LEVEL_AT_M = 15.0
+BATTERY_UNKNOWN = "battery unknown"
 
 
 def idle(now: Situation, memory: Memory, camera: Pinhole) -> Step:
     """On the ground: starts on its own, or on the boat's order, as the mission file says."""
     step = Step(kind=podwatch.setpoint_t.IDLE)
     vehicle = now.inputs.vehicle
+    if memory.reason in (WAITS, BATTERY_UNKNOWN) and now.told:
+        memory.reason = BATTERY_UNKNOWN if now.battery is None else WAITS
     order_us = now.inputs.fleet.order.utime if now.inputs.fleet is not None else 0
     ordered = now.command == podwatch.operator_t.START and order_us > memory.start_order_us
     wanted = ordered or (now.mission.search.start == "auto" and memory.state == State.IDLE)
     blocked = (podwatch.operator_t.HOLD, podwatch.operator_t.RETURN, podwatch.operator_t.LAND)
     if not wanted or now.command in blocked or now.in_state_s < LISTEN_S or vehicle is None:
         return step
-    if now.vehicle_ok and vehicle.landed and vehicle.battery > now.mission.limits.battery_return:
+    charged = now.battery is None or now.battery > now.mission.limits.battery_return
+    if now.vehicle_ok and vehicle.landed and charged:
         memory.start_order_us = max(order_us, memory.start_order_us)
         step.event = Event.START
     return step
@@ -95,7 +99,9 @@ def standby(now: Situation, memory: Memory, camera: Pinhole) -> Step:
 def _lowest_scout(now: Situation) -> int:
     """The drone that shall scout: who scouts already, else the lowest living in the air with charge."""
     able = (State.TAKEOFF, State.SCOUT, State.STANDBY, State.FOUND)
-    rows = [r for r in now.others if r.state in able and r.battery > now.mission.limits.battery_return]
+    least = now.mission.limits.battery_return
+    # A row cannot say "unknown": it says 0, and a drone whose battery is really empty lands.
+    rows = [r for r in now.others if r.state in able and (r.battery > least or r.battery <= 0)]
     scouting = [row.id for row in rows if row.state in (State.SCOUT, State.FOUND)]
     return min(scouting) if scouting else min([now.drone_id, *(row.id for row in rows)])
 

@@ -40,7 +40,7 @@ def overriding_events(now: Situation, memory: Memory) -> list[Event]:
     if pilot_has_it(now):
         return [Event.PILOT]  # the pilot's stick always wins: no order, no battery moves the drone
     events = []
-    if vehicle is not None and now.told and vehicle.battery < limits.battery_land:
+    if now.battery is not None and now.told and now.battery < limits.battery_land:
         events.append(Event.BATTERY_EMPTY)
     if now.command == operator.LAND:
         events.append(Event.ORDER_LAND)
@@ -49,7 +49,7 @@ def overriding_events(now: Situation, memory: Memory) -> list[Event]:
         return events
     if not now.vehicle_ok or down:
         return [*events, Event.DOUBT]
-    if vehicle is not None and vehicle.battery < limits.battery_return:
+    if now.battery is not None and now.battery < limits.battery_return:
         return [*events, Event.BATTERY_LOW]
     if now.command == operator.RETURN:
         events.append(Event.ORDER_RETURN)

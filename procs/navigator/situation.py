@@ -21,6 +21,7 @@ __all__ = ["Find", "Inputs", "Memory", "Outputs", "Situation", "Step", "episode_
 Array = NDArray[np.float64]
 EpisodeKey = tuple[int, int]
 
+WAITS = "waits for the mission to begin"
 VEHICLE_LIMIT_S = 1.0  # an older vehicle state is doubt
 LINK_LIMIT_S = 2.0  # the autopilot's own heartbeat comes at 1 Hz
 
@@ -88,7 +89,7 @@ class Memory:
     poses: PoseHistory = field(default_factory=PoseHistory)
     state: State = State.IDLE
     since_us: int = 0
-    reason: str = "waits for the mission to begin"
+    reason: str = WAITS
     yaw_rad: float | None = None  # the heading at the first word of the autopilot; kept through the flight
     waypoint: int = 0  # last reached by any scout
     target_waypoint: int | None = None
@@ -167,6 +168,12 @@ class Situation:
         vehicle = self.inputs.vehicle
         heard_us = 0 if vehicle is None else self.inputs.vehicle_heard_us or vehicle.utime
         return vehicle is not None and self.link_ok and self.seconds_since(heard_us) <= VEHICLE_LIMIT_S
+
+    @property
+    def battery(self) -> float | None:
+        """0-1, what remains; None where the autopilot does not know it (below 0, or no number)."""
+        vehicle = self.inputs.vehicle
+        return vehicle.battery if vehicle is not None and vehicle.battery >= 0 else None
 
     @property
     def vehicle_ok(self) -> bool:

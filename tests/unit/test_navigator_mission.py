@@ -360,3 +360,27 @@ def test_a_silent_camera_loses_the_animal_and_then_brings_the_drone_home() -> No
     gone_s = fleet.run(80.0, lambda: fleet.all_in(State.RETURN))
     assert 48.0 < gone_s < 54.0
     assert fleet.drone(1).navigator.memory.reason == Event.BLIND.value
+
+
+@pytest.mark.parametrize("battery", [-1.0, float("nan")])
+def test_an_unknown_battery_is_not_an_empty_one(battery: float) -> None:
+    fleet = Fleet(mission(2), POD)
+    first = fleet.drone(1)
+    first.battery = battery
+    row_of = fleet._row
+
+    def row(drone: Drone) -> object:
+        said = row_of(drone)
+        said.battery = max(0.0, said.battery) if said.battery >= 0 else 0.0  # as the relay packs it
+        return said
+
+    fleet._row = row
+    fleet.run(2.5)
+    assert first.said is not None
+    assert (first.navigator.state, first.said.reason) == (State.IDLE, "battery unknown")
+    fleet.run(120.0, lambda: fleet.all_in(State.RENDEZVOUS))
+    assert fleet.all_in(State.RENDEZVOUS)
+    assert State.SCOUT in first.states
+    assert State.SCOUT not in fleet.drone(2).states
+    assert State.RETURN not in first.states
+    assert State.LAND not in first.states
