@@ -343,7 +343,8 @@ def test_all_is_asked_for_again_after_a_gap_in_the_heartbeats(rig):
     rig.sent.clear()
     rig.fly(1.5)
     assert len(rig.commands(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL)) == 5
-    names = [m.param_id for m in rig.sent if m.get_type() == "PARAM_SET"]
+    asked = [m.param_id for m in rig.sent if m.get_type() == "PARAM_SET"]
+    names = [name for name in asked if name in rig.twin.flight.parameters]  # others it repeats: no answer
     assert sorted(names) == sorted(set(names))
     assert "FS_GCS_ENABLE" in names
 
@@ -363,6 +364,21 @@ def test_the_ground_station_failsafe_is_set_and_brings_the_vehicle_home(flying):
     flying.fly(3, kind=setpoint_t.HOLD)
     assert flying.twin.flight.mode == Mode.RTL  # and stays so: nobody asked us
     assert not flying.state["guided"]
+
+
+@pytest.mark.parametrize("has_monitor", [True, False])
+def test_the_battery_failsafes_are_set_where_the_autopilot_has_them_and_missed_by_nobody_else(
+    rig, has_monitor
+):
+    parameters = rig.twin.flight.parameters
+    if has_monitor:
+        parameters |= {"BATT_FS_LOW_ACT": 0.0, "BATT_FS_CRT_ACT": 0.0}
+    rig.fly(8)
+    if has_monitor:
+        assert (parameters["BATT_FS_LOW_ACT"], parameters["BATT_FS_CRT_ACT"]) == (2, 1)
+    names = [m.param_id for m in rig.sent if m.get_type() == "PARAM_SET"]
+    assert names.count("BATT_FS_LOW_ACT") == (1 if has_monitor else 3), "asked for a limited time"
+    assert rig.bridge.problem(rig.utime) == ""
 
 
 def test_a_respawned_bridge_carries_on_in_the_air(flying):
