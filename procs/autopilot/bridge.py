@@ -26,8 +26,8 @@ GROUND_SILENCE_S = 10.0
 FENCE_MARGIN_M = 20.0  # of the autopilot's own fence beyond ours, which acts first
 LARGEST_CIRCLE_M = 10_000.0  # that ArduCopter's fence takes
 FENCE_HEIGHT, FENCE_CIRCLE = 1.0, 2.0  # bits of FENCE_TYPE
-# Return when the battery is low, land when it is nearly empty, should we fail to; at what voltages depends on
-# the battery, which only its owner knows. Preferred only: without a monitor of it ArduPilot has no such names.
+# Return when the battery is low, land when it is nearly empty, should we fail to: at what voltages depends on
+# the battery, and only its owner knows. Preferred only: without a monitor of it ArduPilot lacks these names.
 BATTERY_FAILSAFES = ((("BATT_FS_LOW_ACT", 2.0),), (("BATT_FS_CRT_ACT", 1.0),))
 NEVER_HEARD_MS = 2**31 - 1
 
