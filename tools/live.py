@@ -238,7 +238,7 @@ def _cells(row: _Row, now_s: float) -> tuple[str, ...]:
     return (
         str(row.identity) if row.identity >= 0 else "-",
         "-" if row.height_m is None else f"{round(row.height_m)} m",
-        "-" if row.battery is None else f"{row.battery:.0%}",
+        "-" if row.battery is None or row.battery < 0 else f"{row.battery:.0%}",
         "-" if row.links is None else f"{row.links[0]}/{row.links[1]}",
         _rate(row, channels.FRAME, now_s),
         _rate(row, channels.DETECTIONS, now_s),

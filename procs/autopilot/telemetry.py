@@ -30,7 +30,7 @@ class Telemetry:
     def __init__(self, origin: OriginSettings) -> None:
         self._fleet_origin = origin
         self.heartbeat_utime: int | None = None
-        self.battery = 0.0
+        self.battery = -1.0  # 0-1, the last that was told; below 0 until one is
         self._is_armed_known = False
         self.is_known = False  # heard enough to speak for the vehicle: armed, and what the battery holds
         self.text = ""  # the last warning that the autopilot sent, for people

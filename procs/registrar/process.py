@@ -63,6 +63,7 @@ class RegistrarShell:
         self._living: tuple[int, ...] = (runtime.drone_id,)
         self._able: tuple[int, ...] = self._living  # those of them that may see the pod
         self._wants_episode = False
+        self._last_said: RingPacket | None = None
 
     @property
     def _fleet_utime(self) -> int:
@@ -149,7 +150,9 @@ class RegistrarShell:
             self._registrar.receive(
                 RingPacket(message.episode, message.proposer, message.instant, bytes(message.packet))
             )
-            self._go_on()  # at once: a lap of n hops would take n steps of the timer
+            # At once: a lap of n hops would take n steps of the timer. Only news: two that answer each other
+            # with what both know would fill the link.
+            self._go_on(only_news=True)
             return
         finished = self._registrar.finished
         if finished and (message.episode, message.proposer) == (finished.number, finished.proposer):
@@ -168,9 +171,11 @@ class RegistrarShell:
             runtime.publish(channels.RING_EPISODE, said)
         self._go_on()
 
-    def _go_on(self) -> None:
+    def _go_on(self, *, only_news: bool = False) -> None:
         for packet in self._registrar.step(self._runtime.utime, self._fleet_utime, self._poses.at):
-            self._say(packet)
+            if not (only_news and packet == self._last_said):
+                self._last_said = packet
+                self._say(packet)
 
     def keep_up(self) -> None:
         """Say what is known of the map between episodes."""

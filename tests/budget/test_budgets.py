@@ -29,7 +29,7 @@ from tools.sim.settings import SimMission
 FLOWN_S = 55.0  # search, gathering, the first agreement and some seconds of watching
 
 # Bytes of datagrams that one drone sends to one neighbour, headers and seals counted.
-LINK_BYTES_PER_S = 1000  # mean of the flight; no single second may have more than the mission's cap
+LINK_BYTES_PER_S = 700  # mean of the flight; no single second may have more than the mission's cap
 DATAGRAM_BYTES = 500  # the largest: it fits a small radio's packet unfragmented
 
 # Bytes of messages that one drone logs in a second of flight, pictures apart.
@@ -39,7 +39,7 @@ LOG_BYTES_PER_S = 15_000
 OVER_THE_TABLE = 1.3
 EVENTS_PER_S = {
     channels.RING_EPISODE: 2.0,
-    channels.RING_MAP: 10.0,
+    channels.RING_MAP: 2.0,
     channels.RING_ASSIGN: 2.0,
 }
 

@@ -123,7 +123,7 @@ def flight(near: SimMission, tmp_path_factory: pytest.TempPathFactory) -> Flight
     killer = Killer()
     watch = Watch(near, killer)
     with ProcessFleet(plan, watch) as fleet:
-        fleet.wait_until_ready()
+        fleet.wait_until_ready(lambda: None)
         began, over = time.monotonic(), False
         while not over:
             assert time.monotonic() - began < FLIGHT_LIMIT_S, f"states {killer.states} at {fleet.now_s:.0f} s"

@@ -240,6 +240,17 @@ def test_after_a_jump_of_the_boot_time_nobody_is_told_of_a_landing_before_the_ne
     assert told == [(False, False), (True, False), (False, True), (False, False), (True, False)]
 
 
+def test_a_battery_of_which_nothing_is_told_is_below_0_and_not_empty():
+    telemetry, sender = Telemetry(OriginSettings()), Codec(1, 1)
+    told = []
+    for remaining in (-1, 80, -1):
+        sender.send.sys_status_send(0, 0, 0, 0, 12000, -1, remaining, 0, 0, 0, 0, 0, 0)
+        for message in Codec(255, 190).parse(sender.take()):
+            telemetry.hear(message, 1)
+        told.append(telemetry.battery)
+    assert told == [-1.0, 0.8, 0.8]
+
+
 @given(st.lists(st.binary(max_size=80), max_size=8), st.randoms(use_true_random=False))
 @settings(deadline=None, max_examples=100)
 def test_damaged_bytes_raise_nothing_and_change_nothing(noise: list[bytes], chance: random.Random):

@@ -6,6 +6,7 @@ import json
 import secrets
 import select
 import time
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -72,11 +73,14 @@ class ProcessFleet:
         """Simulation time, s."""
         return self._page.read()[0] / 1e6
 
-    def wait_until_ready(self) -> None:
-        """Until every process has beaten once; then the simulation clock begins. Raises SupervisorError."""
+    def wait_until_ready(self, check_interrupt: Callable[[], None]) -> None:
+        """Until every process has beaten once; then the simulation clock begins. Raises SupervisorError, and
+        what `check_interrupt` raises.
+        """
         wanted = {program(d, p.name) for d in self.plan.mission.roster for p in processes.PROCESSES}
         limit = time.monotonic() + START_LIMIT_S
         while self._page.read()[1] == 0:
+            check_interrupt()
             missing = sorted(wanted - self._heard) or ["world"]
             if time.monotonic() > limit:
                 raise SupervisorError(

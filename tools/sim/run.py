@@ -1,7 +1,10 @@
 """One simulated run from plan to report: choose the mode, fly, judge, write what is left behind."""
 
+import contextlib
 import json
+import signal
 import time
+from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -40,33 +43,56 @@ def prepare(plan: RunPlan) -> None:
         make_key(key)
 
 
+@contextlib.contextmanager
+def _interrupt_between_steps() -> Iterator[Callable[[], None]]:
+    """A Ctrl-C waits for the next call of what this yields, which raises KeyboardInterrupt.
+
+    Python would raise it wherever it happens to be: in a library that swallows it, or while the processes are
+    being stopped.
+    """
+    asked: list[int] = []
+    kept = signal.signal(signal.SIGINT, lambda number, _frame: asked.append(number))
+
+    def check() -> None:
+        if asked:
+            raise KeyboardInterrupt
+
+    try:
+        yield check
+    finally:
+        signal.signal(signal.SIGINT, kept)
+
+
 def fly_lockstep(plan: RunPlan, screen: Screen | None, fallback_reason: str = "") -> None:
     """Fly a plan on the virtual clock and write its notes."""
     prepare(plan)
     watch = Watch(plan.mission, screen)
     began = time.monotonic()
-    fleet = LockstepFleet(plan, watch.hear)
-    try:
-        over = False
-        while not over:
-            fleet.run_until(fleet.now_s + STEP_S)
-            wall_s = time.monotonic() - began
-            over = watch.step(fleet.now_s, fleet, fleet.now_s / max(wall_s, 1e-6))
-    finally:  # a run that was stopped is judged by what it logged
-        fleet.close()
-        write_truth_notes(plan, watch, "lockstep", fallback_reason, fleet.now_s, time.monotonic() - began)
+    with _interrupt_between_steps() as check_interrupt:
+        fleet = LockstepFleet(plan, watch.hear)
+        try:
+            over = False
+            while not over:
+                check_interrupt()
+                fleet.run_until(fleet.now_s + STEP_S)
+                wall_s = time.monotonic() - began
+                over = watch.step(fleet.now_s, fleet, fleet.now_s / max(wall_s, 1e-6))
+        finally:  # a run that was stopped is judged by what it logged
+            fleet.close()
+            write_truth_notes(plan, watch, "lockstep", fallback_reason, fleet.now_s, time.monotonic() - began)
 
 
 def fly_processes(plan: RunPlan, screen: Screen | None) -> None:
     """Fly a plan as operating-system processes and write its notes. Raises SupervisorError."""
     prepare(plan)
     watch = Watch(plan.mission, screen)
-    with ProcessFleet(plan, watch) as fleet:
-        fleet.wait_until_ready()
+    with _interrupt_between_steps() as check_interrupt, ProcessFleet(plan, watch) as fleet:
+        fleet.wait_until_ready(check_interrupt)
         began = time.monotonic()
         try:
             over = False
             while not over:
+                check_interrupt()
                 fleet.look()
                 wall_s = time.monotonic() - began
                 over = watch.step(fleet.now_s, fleet, fleet.now_s / max(wall_s, 1e-6))
