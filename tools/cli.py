@@ -1,15 +1,14 @@
 """The command line: `podwatch COMMAND`. Heavy imports wait until their command is called."""
 
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from tools import log
-from tools.errors import MISSING, plain_errors
+from tools.bench.commands import bench
+from tools.errors import plain_errors, wanted_extra
 from tools.sim.command import sim
 
 # What a video reader cannot open, we tell in words of our own.
@@ -22,7 +21,6 @@ app = typer.Typer(
     add_completion=False,
 )
 train = typer.Typer(help="Train the models that ship (needs the `train` extra).", no_args_is_help=True)
-bench = typer.Typer(help="Measure, and print every figure with its bar.", no_args_is_help=True)
 app.command("sim")(sim)
 app.add_typer(log.app, name="log")
 app.add_typer(train, name="train")
@@ -82,49 +80,10 @@ def train_detector(
     smoke: Annotated[bool, typer.Option("--smoke", help="A few steps, export and check only.")] = False,
 ) -> None:
     """Train the detector and export it to ONNX."""
-    with _training_extra():
+    with wanted_extra("train"):
         from tools.train_detector import Settings, command
     with plain_errors():
         command(out, data, Settings.steps if steps is None else steps, seed, smoke)
-
-
-@bench.command("fleet")
-def bench_fleet(
-    seeds: Annotated[int, typer.Option(min=1, help="Default missions in lockstep.")] = 10,
-    out: Annotated[Path, typer.Option(help="Folder for the runs and the table.")] = Path("runs/bench"),
-    quick: Annotated[
-        bool, typer.Option("--quick", help="Boxes in place of pixels, no processes mode.")
-    ] = False,
-) -> None:
-    """Fly many missions and print every figure of the fleet."""
-    from tools.bench_fleet import command
-
-    with plain_errors():
-        command(seeds, out, quick=quick)
-
-
-@bench.command("detection")
-def bench_detection(
-    scenes: Annotated[int, typer.Option(min=1, help="Rendered scenes a set.")] = 300,
-    seed: Annotated[int, typer.Option(min=0)] = 0,
-) -> None:
-    """Recall, precision and AP50 on held-out photographs and rendered scenes."""
-    with _training_extra():
-        from tools.train_detector import evaluate
-    with plain_errors():
-        evaluate(scenes=scenes, seed=seed)
-
-
-@contextmanager
-def _training_extra() -> Iterator[None]:
-    """Say which extra is missing where an import of the trainer's libraries fails."""
-    try:
-        yield
-    except ImportError as error:
-        typer.echo(
-            f"podwatch: {error.name} is missing; install the extra: pip install 'podwatch[train]'", err=True
-        )
-        raise typer.Exit(MISSING) from None
 
 
 def main() -> None:

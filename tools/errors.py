@@ -12,7 +12,7 @@ from contextlib import contextmanager
 
 import typer
 
-__all__ = ["FAILED", "INTERRUPTED", "MISSING", "UNUSABLE", "exit_code_of", "plain_errors"]
+__all__ = ["FAILED", "INTERRUPTED", "MISSING", "UNUSABLE", "exit_code_of", "plain_errors", "wanted_extra"]
 
 FAILED, UNUSABLE, MISSING = 1, 2, 3
 INTERRUPTED = 130  # as shells say of SIGINT
@@ -46,6 +46,18 @@ def plain_errors() -> Iterator[None]:
             raise
         typer.echo(f"podwatch: {_told(error)}", err=True)
         raise typer.Exit(code) from None
+
+
+@contextmanager
+def wanted_extra(name: str) -> Iterator[None]:
+    """Say which extra is missing where an import of its libraries fails."""
+    try:
+        yield
+    except ImportError as error:
+        typer.echo(
+            f"podwatch: {error.name} is missing; install the extra: pip install 'podwatch[{name}]'", err=True
+        )
+        raise typer.Exit(MISSING) from None
 
 
 def exit_code_of(error: Exception) -> int | None:

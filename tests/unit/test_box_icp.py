@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from procs.registrar.box_icp import box_icp
-from tools.bench_registration import IMAGE_SIZE, PAIRS, Cell, draw_views, pair_success
+from tools.bench.registration import IMAGE_SIZE, PAIRS, Cell, draw_views, pair_success
 
 QUIET = settings(deadline=None, max_examples=8)
 SEEDS = st.integers(0, 2**32 - 1)

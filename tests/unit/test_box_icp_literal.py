@@ -8,7 +8,7 @@ from scipy.optimize import linear_sum_assignment
 
 from procs.registrar._literal import corner_costs, corners_of
 from procs.registrar.box_icp import box_icp
-from tools.bench_registration import PAIRS, pair_success
+from tools.bench.registration import PAIRS, pair_success
 
 
 @settings(deadline=None, max_examples=25)

@@ -14,7 +14,7 @@ import pytest
 from drivers.cameras.pinhole import Pinhole, Pose
 from drivers.sim.render import AnimalView, SeaRenderer
 from procs.tracker.mask_tracker import MaskTracker, Track
-from tools.bench_tracking import picture_moments, run
+from tools.bench.tracking import picture_moments, run
 
 CAMERA = Pinhole((640, 480), np.deg2rad(45.0))
 SEA = SeaRenderer(5, water="atlantic", sea_state=2.0)

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from procs.registrar.box_icp import BoxAlignment, align_marks
 from procs.registrar.map import HEADER_BYTES, MAX_ANIMALS, MapAnimal, Memory
 from procs.registrar.ring import RingNode, ViewGeometry, register_ring
-from tools.bench_registration import CAMERA, IMAGE_SIZE, Cell, draw_views, is_ring_right
+from tools.bench.registration import CAMERA, IMAGE_SIZE, Cell, draw_views, is_ring_right
 
 EPISODE, PROPOSER = 4, 2
 

@@ -4,46 +4,31 @@ Each row has n, seed, figure, bar and pass; a row whose figure could not be had 
 below the table.
 """
 
-import json
 import statistics
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from rich.console import Console
-from rich.table import Table
 
 from lcmtypes import channels
 from logs.reader import read
 from procs import processes
+from tools.bench.table import Row, measured, print_table, write_table
 from tools.sim.command import read_mission, with_overrides
 from tools.sim.lockstep import LockstepFleet
 from tools.sim.plan import RunPlan
 from tools.sim.run import finish, fly_lockstep, fly_processes, new_folder, prepare
 from tools.sim.settings import SimMission
 
-__all__ = ["Row", "command"]
+__all__ = ["command"]
 
 PIXEL_FLEETS = (1, 3, 5, 10)
 BOX_FLEETS = (1, 5, 10, 20, 50)
 SPEED_FROM_S, SPEED_FOR_S = 12.0, 8.0  # in flight, after the take-off
 MOST_ANIMALS = 20
-
-
-@dataclass(frozen=True)
-class Row:
-    """One line of the table; `figure` None is MISSING, `passed` None where there is no bar."""
-
-    name: str
-    n: int
-    seed: str
-    figure: str | None
-    bar: str = ""
-    passed: bool | None = None
-    why: str = ""
 
 
 def command(seeds: int, out: Path, *, quick: bool) -> None:
@@ -60,13 +45,9 @@ def command(seeds: int, out: Path, *, quick: bool) -> None:
     rows: list[Row] = []
     for name, measure in groups:
         with console.status(name):
-            try:
-                rows += measure()
-            except Exception as error:  # a bench that falls says so in its table and measures the rest
-                rows.append(Row(name, 0, "-", None, why=f"{type(error).__name__}: {error}"))
-    _print(rows, console)
-    out.mkdir(parents=True, exist_ok=True)
-    (out / "bench_fleet.json").write_text(json.dumps([asdict(row) for row in rows], indent=2) + "\n")
+            rows += measured(measure(), name)
+    print_table("podwatch bench fleet", rows, console)
+    write_table(out / "bench_fleet.json", rows)
 
 
 def default_missions(seeds: int, out: Path, sensor: str) -> Iterator[Row]:
@@ -80,7 +61,7 @@ def default_missions(seeds: int, out: Path, sensor: str) -> Iterator[Row]:
     wrong = [str(seed) for seed, ok in enumerate(right, 1) if not ok]
     why = f"not in seed {', '.join(wrong)}" if wrong else ""
     name = f"every drone over a different animal, identities agreed ({sensor})"
-    yield Row(name, seeds, label, f"{100 * share:.0f} %", ">= 90 %", share >= 0.9, why)
+    yield Row(name, seeds, label, f"{100 * share:.0f} %", ">= 90 %", "", share >= 0.9, why)
     to_monitor = [s["seconds_to_monitor"] for s in summaries if s["seconds_to_monitor"] is not None]
     figure = f"{statistics.median(to_monitor):.0f} s (most {max(to_monitor):.0f})" if to_monitor else None
     yield Row("seconds to MONITOR, median", len(to_monitor), label, figure)
@@ -88,7 +69,12 @@ def default_missions(seeds: int, out: Path, sensor: str) -> Iterator[Row]:
     mean = statistics.mean(inside) if inside else 0.0
     shares = f"{100 * mean:.1f} % (least {100 * min(inside):.1f})" if inside else None
     yield Row(
-        "MONITOR time with the animal inside the image", len(inside), label, shares, ">= 95 %", mean >= 0.95
+        "MONITOR time with the animal inside the image",
+        len(inside),
+        label,
+        shares,
+        ">= 95 %",
+        passed=mean >= 0.95,
     )
 
 
@@ -102,15 +88,17 @@ def processes_mode(out: Path) -> Iterator[Row]:
     figure: str | None
     if latency["p50"] is not None:
         figure = f"{latency['p50']:.0f} ms, {latency['p99']:.0f} ms"
-        yield Row("camera to setpoint, p50 and p99", 1, seed, figure, "p99 <= 250 ms", latency["p99"] <= 250)
+        yield Row(
+            "camera to setpoint, p50 and p99", 1, seed, figure, "p99 <= 250 ms", passed=latency["p99"] <= 250
+        )
     else:
         yield Row("camera to setpoint, p50 and p99", 1, seed, None, why="no setpoint rested on a frame")
     rates = [drone["tracker_hz"] for drone in summary["drones"] if drone["tracker_hz"]]
     slowest = min(rates, default=0.0)
     figure = f"{slowest:.1f} Hz in the slowest drone" if rates else None
-    yield Row("tracker rate, simulated time", len(rates), seed, figure, ">= 19 Hz", slowest >= 19)
+    yield Row("tracker rate, simulated time", len(rates), seed, figure, ">= 19 Hz", passed=slowest >= 19)
     factor = summary["realtime_factor"]
-    yield Row("realtime factor, whole mission", 1, seed, f"{factor:.2f}", ">= 0.8", factor >= 0.8)
+    yield Row("realtime factor, whole mission", 1, seed, f"{factor:.2f}", ">= 0.8", passed=factor >= 0.8)
     for link in summary["links"]:
         kinds = ", ".join(f"{kind} {rate:.0f}" for kind, rate in sorted(link["bytes_per_s"].items()))
         yield Row(f"bytes/s on link {link['from']} to {link['to']}", 1, seed, kinds)
@@ -143,7 +131,7 @@ def largest_messages(out: Path) -> Iterator[Row]:
         most = max((link[key] for link in summary["links"]), default=None)
         figure = f"{most} B" if most is not None else None
         passed = most is not None and most <= bar
-        yield Row(f"largest {name} with {MOST_ANIMALS} animals", 1, "1", figure, f"<= {bar} B", passed)
+        yield Row(f"largest {name} with {MOST_ANIMALS} animals", 1, "1", figure, f"<= {bar} B", passed=passed)
 
 
 def lockstep_speed(out: Path, *, quick: bool) -> Iterator[Row]:
@@ -172,18 +160,3 @@ def _fly(mission: SimMission, out: Path, sensor: str) -> dict[str, Any]:
     plan = RunPlan(mission, new_folder(out), sensor)
     fly_lockstep(plan, None)
     return finish(plan.folder)
-
-
-def _print(rows: list[Row], console: Console) -> None:
-    table = Table(title="podwatch bench fleet", title_justify="left")
-    for heading in ("what", "n", "seed", "figure", "bar", "pass"):
-        table.add_column(heading, overflow="fold")
-    words = {True: "yes", False: "[bold red]no[/]", None: ""}
-    for row in rows:
-        figure = row.figure if row.figure is not None else "[bold red]MISSING[/]"
-        passed = words[row.passed if row.figure is not None else None]
-        table.add_row(row.name, str(row.n), row.seed, figure, row.bar, passed)
-    console.print(table)
-    for row in rows:
-        if row.why:
-            console.print(f"{row.name}: {row.why}", highlight=False, markup=False)

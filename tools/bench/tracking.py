@@ -1,6 +1,6 @@
 """Measures the mask tracker: frames a second of one thread's CPU time, how often its centre is on the animal.
 
-    python -m tools.bench_tracking [--seeds 10] [--pictures 24] [--detector] [--vehicle] [--overlays FOLDER]
+    python -m tools.bench.tracking [--seeds 10] [--pictures 24] [--detector] [--vehicle] [--overlays FOLDER]
 
 Rendered sequences: three whales within a few lengths of each other, swimming and turning, under a drone that
 follows late, yaws and tilts; the watched one dives in every third. Photographs: the odd-numbered ones of

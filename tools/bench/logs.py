@@ -1,4 +1,4 @@
-"""Messages a second that the log writer takes, beside lcm's own event log: `python -m tools.bench_logs`."""
+"""Messages a second that the log writer takes, beside lcm's own event log: `python -m tools.bench.logs`."""
 
 import tempfile
 import time

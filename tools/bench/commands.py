@@ -1,0 +1,39 @@
+"""The commands `podwatch bench ...`. Heavy imports wait until their command is called."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from tools.errors import plain_errors, wanted_extra
+
+__all__ = ["bench"]
+
+bench = typer.Typer(help="Measure, and print every figure with its bar.", no_args_is_help=True)
+
+
+@bench.command("fleet")
+def bench_fleet(
+    seeds: Annotated[int, typer.Option(min=1, help="Default missions in lockstep.")] = 10,
+    out: Annotated[Path, typer.Option(help="Folder for the runs and the table.")] = Path("runs/bench"),
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Boxes in place of pixels, no processes mode.")
+    ] = False,
+) -> None:
+    """Fly many missions and print every figure of the fleet."""
+    from tools.bench.fleet import command
+
+    with plain_errors():
+        command(seeds, out, quick=quick)
+
+
+@bench.command("detection")
+def bench_detection(
+    scenes: Annotated[int, typer.Option(min=1, help="Rendered scenes a set.")] = 300,
+    seed: Annotated[int, typer.Option(min=0)] = 0,
+) -> None:
+    """Recall, precision and AP50 on held-out photographs and rendered scenes."""
+    with wanted_extra("train"):
+        from tools.train_detector import evaluate
+    with plain_errors():
+        evaluate(scenes=scenes, seed=seed)
