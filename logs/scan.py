@@ -45,6 +45,7 @@ class RawMessage(NamedTuple):
     type_name: str  # the schema's name, "" where the log has none
     log_time_ns: int
     data: bytes
+    schema_text: bytes = b""  # the schema's .lcm text
 
 
 class _Record(NamedTuple):
@@ -160,9 +161,9 @@ class Scan:
                 self._n_undefined += 1
                 return
             schema = self._schemas.get(channel.schema_id)
-            name = schema.name if schema else ""
+            name, text = (schema.name, schema.data) if schema else ("", b"")
             self.channel_types.setdefault(channel.topic, name)
-            yield RawMessage(channel.topic, name, log_time_ns, body[MESSAGE_HEAD.size :])
+            yield RawMessage(channel.topic, name, log_time_ns, body[MESSAGE_HEAD.size :], text)
 
     def _define(self, opcode: int, body: bytes) -> None:
         if opcode == Opcode.SCHEMA:
@@ -218,7 +219,7 @@ def _check_magic(path: Path, file: BinaryIO, n_bytes: int) -> None:
             f"{path}: is empty (0 bytes), so nothing was logged; look for another segment beside it"
         )
     if magic.startswith(LCM_EVENT_MAGIC):
-        raise LogError(f"{path}: is an LCM event log, not MCAP; read it with lcm.EventLog")
+        raise LogError(f"{path}: is an LCM event log, not MCAP; turn it into one with podwatch log from-lcm")
     if MCAP0_MAGIC.startswith(magic):
         raise LogError(
             f"{path}: is cut off within its first {len(MCAP0_MAGIC)} bytes ({n_bytes} bytes); nothing is left"

@@ -6,10 +6,11 @@ from typing import NamedTuple
 from lcmtypes import channels, podwatch
 from logs.schemas import fingerprint
 
-__all__ = ["GapCounter", "Head", "read_head"]
+__all__ = ["DRONE_ID_OFFSET", "GapCounter", "Head", "read_head"]
 
 HEAD = struct.Struct(">8sqi")  # fingerprint, int64 utime, int32 seq
-PROCESS_OFFSET = HEAD.size + 1  # of the process's name in a heartbeat, behind int8 drone_id
+DRONE_ID_OFFSET = HEAD.size  # int8
+PROCESS_OFFSET = DRONE_ID_OFFSET + 1  # of the process's name in a heartbeat, behind int8 drone_id
 STRING_LENGTH = struct.Struct(">i")
 HEARTBEAT = fingerprint(podwatch.heartbeat_t)
 

@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
 from typing import IO, Any, cast
 
@@ -81,8 +82,8 @@ class LogWriter:
         self.path = Path(path)
         self._drone_id = drone_id
         self._chunk_start_us: int | None = None
-        self._channel_ids: dict[tuple[str, bool], int] = {}
-        self._schema_ids: dict[str, int] = {}
+        self._channel_ids: dict[tuple[str, tuple[str, bytes] | None], int] = {}
+        self._schema_ids: dict[tuple[str, bytes], int] = {}
         try:
             self._file = _AppendedFile(self.path.absolute())
         except FileExistsError:
@@ -105,8 +106,12 @@ class LogWriter:
         """Size of the file so far; the chunk in the making is not in it."""
         return self._file.tell()
 
-    def write(self, channel: str, data: bytes, utime: int) -> None:
-        """Add one message as it came from the bus; `utime` (us, drone clock) is its log and publish time."""
+    def write(self, channel: str, data: bytes, utime: int, foreign: tuple[str, bytes] | None = None) -> None:
+        """Add one message as it came from the bus; `utime` (us, drone clock) is its log and publish time.
+
+        foreign: name and .lcm text of a type that is none of this version's, as the log that it is copied
+        from gave them.
+        """
         if not 0 <= utime <= MAX_TIME_US:
             raise LogError(
                 f"{self.path}: utime {utime} us of {channel} lies outside 0 to {MAX_TIME_US}, MCAP's range"
@@ -114,7 +119,7 @@ class LogWriter:
         self.flush_due(utime)
         head = read_head(channel, data)
         self._mcap.add_message(
-            channel_id=self._channel_id(channel, is_known=head is not None),
+            channel_id=self._channel_id(channel, None if head is None else _own_schema(channel), foreign),
             log_time=utime * 1000,
             publish_time=utime * 1000,
             data=data,
@@ -139,29 +144,39 @@ class LogWriter:
         self._mcap.finish()
         self._file.flush()
 
-    def _channel_id(self, channel: str, *, is_known: bool) -> int:
-        """The MCAP channel of a bus channel; bytes of another type on it go to a channel without a schema."""
-        key = (channel, is_known)
+    def _channel_id(
+        self, channel: str, own: tuple[str, bytes] | None, foreign: tuple[str, bytes] | None
+    ) -> int:
+        """The MCAP channel of a bus channel; bytes of another type on it go to a channel of that type, or to
+        one without a schema.
+        """
+        schema = own or foreign
+        key = (channel, schema)
         if key not in self._channel_ids:
             if len(self._channel_ids) >= MAX_CHANNELS:
                 raise LogError(
                     f"{self.path}: {channel} is refused, {MAX_CHANNELS} channels are the limit of a log"
                 )
-            kind = channels.kind_of(channel) if is_known else None
             metadata = {"drone": str(self._drone_id)}
-            if kind is not None:
+            kind = channels.kind_of(channel)
+            if own is not None and kind is not None:
                 metadata["fingerprint"] = fingerprint(kind).hex()
             self._channel_ids[key] = self._mcap.register_channel(
                 topic=channel,
                 message_encoding=ENCODING,
-                schema_id=self._schema_id(kind) if kind else 0,
+                schema_id=self._schema_id(*schema) if schema else 0,
                 metadata=metadata,
             )
         return self._channel_ids[key]
 
-    def _schema_id(self, kind: type) -> int:
-        name = type_name(kind)
-        if name not in self._schema_ids:
-            text = lcm_text(kind).encode("utf-8")
-            self._schema_ids[name] = self._mcap.register_schema(name=name, encoding=ENCODING, data=text)
-        return self._schema_ids[name]
+    def _schema_id(self, name: str, text: bytes) -> int:
+        if (name, text) not in self._schema_ids:
+            self._schema_ids[name, text] = self._mcap.register_schema(name=name, encoding=ENCODING, data=text)
+        return self._schema_ids[name, text]
+
+
+@cache
+def _own_schema(channel: str) -> tuple[str, bytes] | None:
+    """(name, .lcm text) of the channel table's type of a channel, None for a channel that it lacks."""
+    kind: type | None = channels.kind_of(channel)
+    return (type_name(kind), lcm_text(kind).encode("utf-8")) if kind else None

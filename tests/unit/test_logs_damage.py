@@ -228,7 +228,7 @@ FOREIGN = {
     "text": (b"t_s,kind,id", "is no MCAP file (begins with b't_s,kind'); give the path of a .mcap log"),
     "event log": (
         bytes.fromhex("eda1da010000000000"),
-        "is an LCM event log, not MCAP; read it with lcm.EventLog",
+        "is an LCM event log, not MCAP; turn it into one with podwatch log from-lcm",
     ),
     "cut magic": (b"\x89MCAP", "is cut off within its first 8 bytes (5 bytes); nothing is left"),
 }

@@ -1,10 +1,6 @@
 """`podwatch log`: look into a drone's MCAP log. `info` says what it holds, `cat` prints its messages."""
 
 import sys
-import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
-from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -12,32 +8,28 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from logs.exceptions import LogError, LogWarning
+from logs.exceptions import LogError
 from logs.reader import LogInfo, info, read, segments
 from logs.schemas import PACKAGE
+from tools.log.shared import LogPath, app, clear_errors, size_text, warn
 
-__all__ = ["app", "describe"]
+__all__ = ["describe"]
 
-EXIT_BAD_INPUT = 2
 LONGEST_LIST = 8  # items of a list that `cat` prints; the rest is counted
 TABLE_COLUMNS = 100
 LONGEST_RAW = 16  # bytes of undecoded data that `cat` prints
-
-app = typer.Typer(help="Look into a drone's MCAP log.", no_args_is_help=True)
-
-LogPath = Annotated[Path, typer.Argument(help="A drone's .mcap log, as in runs/<time>/.", show_default=False)]
 
 
 @app.command("info")
 def show_info(path: LogPath) -> None:
     """Say what a log holds: its span, its channels, their rates and sizes, and whether it is whole."""
-    with _clear_errors():
+    with clear_errors():
         log = info(path)
     sys.stdout.write(f"{_summary(log)}\n\n")
     # Wide enough that no name is cut, in a pipe and in a narrow terminal too.
     Console(file=sys.stdout, width=max(Console().width, TABLE_COLUMNS)).print(_table(log))
     for problem in log.problems:
-        sys.stderr.write(f"warning: {problem}\n")
+        warn(problem)
 
 
 @app.command("cat")
@@ -53,7 +45,7 @@ def show_messages(
     limit: Annotated[int | None, typer.Option(min=1, help="At most this many messages.")] = None,
 ) -> None:
     """Print a log's messages, one a line: seconds from the log's start, channel, members."""
-    with _clear_errors():
+    with clear_errors():
         if end is not None and end < start:
             raise LogError(f"--end {end:g} lies before --start {start:g}; give an end of at least the start")
         start_ns = info(path).start_ns
@@ -95,7 +87,7 @@ def _summary(log: LogInfo) -> str:
     drone = log.metadata.get("drone_id", "not said")
     lines = [
         f"{log.path}",
-        f"drone {drone}, {log.n_messages} messages in {log.span_s:.3f} s, {_size(log.n_bytes)}, "
+        f"drone {drone}, {log.n_messages} messages in {log.span_s:.3f} s, {size_text(log.n_bytes)}, "
         f"{'closed' if log.closed else 'NOT closed'}",
         f"drone clock {log.start_ns / 1e9:.6f} s to {log.end_ns / 1e9:.6f} s",
     ]
@@ -117,32 +109,8 @@ def _table(log: LogInfo) -> Table:
             channel.type_name.removeprefix(f"{PACKAGE}.") or "not known",
             str(channel.n_messages),
             f"{channel.rate_hz:.2f}",
-            _size(channel.n_bytes),
-            _size(round(channel.n_bytes / channel.n_messages)),
+            size_text(channel.n_bytes),
+            size_text(round(channel.n_bytes / channel.n_messages)),
             "-" if channel.n_lost is None else str(channel.n_lost),
         )
     return table
-
-
-def _size(n_bytes: int) -> str:
-    for unit, scale in (("MB", 1e6), ("kB", 1e3)):
-        if n_bytes >= scale:
-            return f"{n_bytes / scale:.1f} {unit}"
-    return f"{n_bytes} B"
-
-
-@contextmanager
-def _clear_errors() -> Iterator[None]:
-    """A LogError becomes a line on stderr and exit code 2, a LogWarning a line on stderr."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("always", LogWarning)
-        warnings.showwarning = _show_warning
-        try:
-            yield
-        except LogError as error:
-            sys.stderr.write(f"{error}\n")
-            raise typer.Exit(EXIT_BAD_INPUT) from None
-
-
-def _show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
-    sys.stderr.write(f"warning: {message}\n")
