@@ -15,6 +15,7 @@ FORBIDDEN = 0xFFFF
 NONE = -1
 UNIT = 2.0**-27  # metres an integer step: codes reach from 15 nm to 65 km
 _FORBIDDEN_VALUE = 2.0**45  # above any code, yet sums over 99 drones stay exact in a float64
+_UNLISTED_MORE = 2.0**36  # 512 m more than the dearest goal that an agent told of
 
 Ints = NDArray[np.int64]
 Codes = NDArray[np.uint16]
@@ -48,23 +49,34 @@ def code_values(codes: Codes) -> NDArray[np.float64]:
     return np.asarray(np.where(wide == FORBIDDEN, _FORBIDDEN_VALUE, values))
 
 
-def solve_table(codes: Codes, previous: Ints | None = None, threshold: float = 0.0) -> Ints:
+def solve_table(
+    codes: Codes,
+    previous: Ints | None = None,
+    threshold: float = 0.0,
+    unlisted: NDArray[np.bool_] | None = None,
+) -> Ints:
     """The cheapest choice of distinct goals: codes (n_agents, n_goals) -> (n_agents,) goal column, NONE for
     who gets none.
 
     `previous` (n_agents,) is each agent's column so far, or NONE; it counts as cheaper by `threshold` (in
-    the costs' unit), so that an assignment changes only for a larger gain. All sums are exact: agents with
-    equal tables find equal answers.
+    the costs' unit), so that an assignment changes only for a larger gain. `unlisted` (n_agents, n_goals):
+    goals that an agent may take but of which it told no cost; they count as dearer than any it told. All
+    sums are exact: agents with equal tables find equal answers.
     """
     n_agents, n_goals = codes.shape
     choice = np.full(n_agents, NONE, dtype=np.int64)
     if n_agents == 0 or n_goals == 0:
         return choice
     values = code_values(codes)
+    may = codes != FORBIDDEN
+    if unlisted is not None:
+        dearest = np.where(may, values, 0.0).max(axis=1, keepdims=True)
+        values = np.where(unlisted, np.minimum(dearest + _UNLISTED_MORE, _FORBIDDEN_VALUE / 128), values)
+        may = may | unlisted
     if previous is not None and threshold > 0:
         kept = np.flatnonzero(previous >= 0)
         values[kept, previous[kept]] -= np.round(threshold / UNIT)
     rows, columns = linear_sum_assignment(values)
-    allowed = codes[rows, columns] != FORBIDDEN
+    allowed = may[rows, columns]
     choice[rows[allowed]] = columns[allowed]
     return choice

@@ -9,129 +9,21 @@ animal until now has let go of it. A holder lets go when everybody has confirmed
 and distinct; so nobody takes an animal that its holder may still watch, and nobody gives one up for an
 exchange that never ends.
 
-Packet: version, sender, n_members (1 byte each); four bitmaps by member index (rows, choices, confirmed,
-released), lowest bit first; 1 byte an animal id for each choice held, 255 for none; then rows up to the end:
-member, previous animal (255 none), n (1 byte each), n ids (1 byte), n costs (2 bytes, little-endian,
-costs.py).
+In a large fleet a row lists the nearest animals only (rule.py); packets.py has the wire format.
 """
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from procs.assigner.costs import FORBIDDEN, cost_codes, solve_table
+from procs.assigner.packets import MOST_LISTED, NO_ID, Packet, Row, decode, encode, row_room
 
-__all__ = ["MAX_PACKET_BYTES", "Agent", "Packet", "Row", "decode", "encode"]
+__all__ = ["Agent"]
 
-MAX_PACKET_BYTES = 308  # the paper's bound on what a neighbour is sent
-VERSION = 1
-NO_ID = 255
 REPEAT_S = 1.0  # pace once every neighbour holds everything; before that each step speaks
 UNHEARD = -2
-
-
-@dataclass(frozen=True)
-class Row:
-    """One member's costs: `codes` for the animals `ids`, and the animal that it watches already (-1 none)."""
-
-    ids: tuple[int, ...]
-    codes: tuple[int, ...]
-    previous: int = -1
-
-    @property
-    def n_bytes(self) -> int:
-        return 3 + 3 * len(self.ids)
-
-
-@dataclass(frozen=True)
-class Packet:
-    """What one member says it holds; `rows` are a window of the rows in `rows_held`."""
-
-    sender: int
-    n_members: int
-    rows_held: frozenset[int]
-    choices: dict[int, int]  # member -> animal id, -1 none
-    confirmed: frozenset[int]  # they hold every member's choice, all distinct
-    released: frozenset[int]  # they have let go of the animal that they watched before
-    rows: dict[int, Row]
-
-
-def _bitmap(indices: Iterable[int], n: int) -> bytes:
-    bits = sum(1 << index for index in indices)
-    return bits.to_bytes((n + 7) // 8, "little")
-
-
-def encode(packet: Packet) -> bytes:
-    """The packet's bytes; `decode` gives it back."""
-    n = packet.n_members
-    parts = [bytes([VERSION, packet.sender, n])]
-    parts += [
-        _bitmap(held, n) for held in (packet.rows_held, packet.choices, packet.confirmed, packet.released)
-    ]
-    parts.append(bytes(packet.choices[k] % 256 for k in sorted(packet.choices)))
-    for member in sorted(packet.rows):
-        row = packet.rows[member]
-        parts.append(bytes([member, row.previous % 256, len(row.ids), *row.ids]))
-        parts.append(np.array(row.codes, dtype="<u2").tobytes())
-    return b"".join(parts)
-
-
-class _Reader:
-    """Takes bytes from the front and says what was missing when they run out."""
-
-    def __init__(self, data: bytes) -> None:
-        self.data = data
-        self.at = 0
-
-    def take(self, count: int, what: str) -> bytes:
-        piece = self.data[self.at : self.at + count]
-        if len(piece) < count:
-            raise ValueError(
-                f"packet of {len(self.data)} bytes ends inside {what}: {count} bytes from {self.at} wanted"
-            )
-        self.at += count
-        return piece
-
-    def members(self, n: int, what: str) -> list[int]:
-        bits = int.from_bytes(self.take((n + 7) // 8, what), "little")
-        if bits >> n:
-            raise ValueError(f"{what}: names a member beyond the {n} of this episode")
-        return [k for k in range(n) if bits >> k & 1]
-
-
-def decode(data: bytes) -> Packet:
-    """A packet from its bytes; ValueError says what is wrong with one that `encode` did not make."""
-    reader = _Reader(data)
-    version, sender, n = reader.take(3, "the header")
-    if version != VERSION:
-        raise ValueError(
-            f"version {version}: this drone speaks version {VERSION}; use one release in the whole fleet"
-        )
-    if not sender < n:
-        raise ValueError(f"sender {sender} is not one of the {n} members")
-    rows_held = reader.members(n, "the rows' bitmap")
-    chosen = reader.members(n, "the choices' bitmap")
-    confirmed = reader.members(n, "the confirmations' bitmap")
-    released = reader.members(n, "the releases' bitmap")
-    ids = reader.take(len(chosen), "the choices")
-    rows = {}
-    while reader.at < len(data):
-        member, previous, count = reader.take(3, "a row's header")
-        if member >= n:
-            raise ValueError(f"row of member {member}: there are only {n}")
-        row_ids = tuple(reader.take(count, "a row's ids"))
-        codes = tuple(
-            int(code) for code in np.frombuffer(reader.take(2 * count, "a row's costs"), dtype="<u2")
-        )
-        if len(set(row_ids)) != count or NO_ID in row_ids:
-            raise ValueError(
-                f"row of member {member}: ids {row_ids} repeat or hold {NO_ID}, which means none"
-            )
-        rows[member] = Row(row_ids, codes, -1 if previous == NO_ID else previous)
-    choices = {k: -1 if animal == NO_ID else animal for k, animal in zip(chosen, ids, strict=True)}
-    return Packet(sender, n, frozenset(rows_held), choices, frozenset(confirmed), frozenset(released), rows)
 
 
 class Agent:
@@ -140,8 +32,9 @@ class Agent:
     index, n_members: its place among the episode's members, in ring order, 0 first. own_costs (G,): metres
     on the ground to each of `goals` (G animal ids, 0-254); inf forbids. previous: the animal that it watches
     already, -1 none. forbidden: ids that it must not take (ordered to leave, or watched by a drone that is
-    no member). threshold_m: gain for which it is worth to change. Raises ValueError for arguments that
-    cannot be: an index outside the members, costs and goals of different lengths, an id outside 0-254 or
+    no member). threshold_m: gain for which it is worth to change. listed: it tells the others of so many
+    animals, the nearest, and of its own and the forbidden ones; None: of all. Raises ValueError for arguments
+    that cannot be: an index outside the members, costs and goals of different lengths, an id outside 0-254 or
     named twice, a row too long for a packet.
     """
 
@@ -155,6 +48,7 @@ class Agent:
         previous: int = -1,
         forbidden: Sequence[int] = (),
         threshold_m: float = 5.0,
+        listed: int | None = None,
     ) -> None:
         if not 0 <= index < n_members <= 99:
             raise ValueError(f"index {index} of {n_members} members: there are 1 to 99, counted from 0")
@@ -169,13 +63,16 @@ class Agent:
             )
         costs[[k for k, goal in enumerate(goals) if goal in forbidden]] = np.inf
         self.index, self.n_members, self.threshold_m = index, n_members, threshold_m
-        codes = tuple(int(code) for code in cost_codes(costs))
-        row = Row(tuple(int(goal) for goal in goals), codes, previous if previous not in forbidden else -1)
-        self._room = MAX_PACKET_BYTES - 3 - 4 * ((n_members + 7) // 8) - n_members
-        if row.n_bytes > self._room:
-            most = (self._room - 3) // 3
+        previous = previous if previous not in forbidden else -1
+        row = _own_row(costs, [int(goal) for goal in goals], previous, listed)
+        self._may_take = sorted(
+            int(goal) for goal, cost in zip(goals, costs, strict=True) if np.isfinite(cost)
+        )
+        self._room = row_room(n_members)
+        if row.n_bytes > self._room or len(row.ids) > MOST_LISTED:
+            most = min((self._room - 3) // 3, MOST_LISTED)
             raise ValueError(
-                f"{len(goals)} goals: a packet for {n_members} members has room for {most}; split the pod"
+                f"{len(row.ids)} goals: a packet for {n_members} members has room for {most}; list fewer"
             )
         self.rows: dict[int, Row] = {index: row}
         self._choices: dict[int, int] = {}
@@ -287,13 +184,31 @@ class Agent:
         ids = sorted({animal for k in members for animal in self.rows[k].ids})
         column = {animal: k for k, animal in enumerate(ids)}
         codes = np.full((len(members), len(ids)), FORBIDDEN, dtype=np.uint16)
+        unlisted = np.zeros(codes.shape, dtype=bool)
         previous = np.full(len(members), -1, dtype=np.int64)
         for k, member in enumerate(members):
             row = self.rows[member]
-            codes[k, [column[animal] for animal in row.ids]] = row.codes
+            listed = [column[animal] for animal in row.ids]
+            unlisted[k] = row.is_cut
+            unlisted[k, listed] = False
+            codes[k, listed] = row.codes
             previous[k] = column.get(row.previous, -1)
-        mine = solve_table(codes, previous, self.threshold_m)[members.index(self.index)]
-        return ids[mine] if mine >= 0 else -1
+        chosen = solve_table(codes, previous, self.threshold_m, unlisted)
+        mine = int(chosen[members.index(self.index)])
+        return ids[mine] if mine >= 0 else self._spare(chosen, ids)
+
+    def _spare(self, chosen: NDArray[np.int64], ids: list[int]) -> int:
+        """An animal that no row lists, for an agent that gets none of those that are: the first such agent
+        takes the first such animal, the second the second. -1 where that is none.
+        """
+        left_over = [
+            member
+            for k, member in enumerate(self.living)
+            if chosen[k] < 0 and self.rows[member].is_cut and member <= self.index
+        ]
+        spare = [animal for animal in self._may_take if animal not in ids]
+        is_cut = self.rows[self.index].is_cut
+        return spare[len(left_over) - 1] if is_cut and len(left_over) <= len(spare) else -1
 
     def _all_distinct(self) -> bool:
         if self.clash or any(k not in self._choices for k in self.living):
@@ -355,3 +270,13 @@ class Agent:
             room -= self.rows[k].n_bytes
             self._next_row = k + 1
         return window
+
+
+def _own_row(costs: NDArray[np.float64], goals: list[int], previous: int, listed: int | None) -> Row:
+    """The row that an agent says of itself; `listed`: as in Agent."""
+    kept = list(range(len(goals)))
+    if listed is not None and listed < len(goals):
+        near = np.argsort(costs, kind="stable")[:listed].tolist()
+        kept = [k for k in kept if k in near or goals[k] == previous or np.isinf(costs[k])]
+    codes = tuple(int(code) for code in cost_codes(costs[kept]))
+    return Row(tuple(goals[k] for k in kept), codes, previous, is_cut=len(kept) < len(goals))

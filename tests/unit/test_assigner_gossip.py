@@ -6,7 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linear_sum_assignment
 
-from procs.assigner.gossip import MAX_PACKET_BYTES, Agent, Packet, Row, decode, encode
+from procs.assigner.gossip import Agent
+from procs.assigner.packets import MAX_PACKET_BYTES, Packet, Row, decode, encode
 
 IDS = st.integers(0, 254)
 quick = settings(deadline=None, max_examples=60)
@@ -43,7 +44,7 @@ def test_a_packet_comes_back_from_its_bytes(packet: Packet) -> None:
 @settings(deadline=None, max_examples=200)
 @given(st.binary(max_size=120), st.integers(1, 5))
 def test_any_bytes_are_a_packet_or_refused(data: bytes, n: int) -> None:
-    for guess in (data, bytes([1, 0, n]) + data):
+    for guess in (data, bytes([2, 0, n]) + data):
         try:
             packet = decode(guess)
         except ValueError:
@@ -57,7 +58,7 @@ def test_bad_packets_say_what_is_wrong() -> None:
         (good[:-1], "ends inside a row's costs"),
         (good[:2], "ends inside the header"),
         (bytes([9]) + good[1:], "version 9"),
-        (bytes([1, 5]) + good[2:], "sender 5"),
+        (bytes([2, 5]) + good[2:], "sender 5"),
         (good[:3] + bytes([255]) + good[4:], "beyond the 2"),
     ):
         with pytest.raises(ValueError, match=words):
