@@ -15,6 +15,9 @@ LAYER_SPAN = (
 )
 TILT_MARGIN_RAD = np.radians(5.0)
 BARRIER_PER_S = 0.7  # how fast a drone may use up the distance that it has left
+# A report is carried forward by its velocity for so long at most; then its drone may have turned, or stand.
+CARRY_S = 5.0
+DRIFT_M_S, DRIFT_MOST_M = 0.2, 4.0  # how the place of a drone grows that is not heard for longer than that
 REACH_M = 15.0  # drones further off than the clearance and this are not looked at
 
 
@@ -83,13 +86,16 @@ def separate(
     dimensions.
 
     others_ned, others_velocity_ned: (K, 3) as last heard, `ages_s` (K,) ago. Each place is carried forward
-    and its clearance grown by speed x age (at most max_growth_m). The closing speed may not exceed 0.7/s of
-    the distance left; what that takes away is given back to the right-hand side, so that two drones that
-    meet head on pass each other.
+    and its clearance grown by speed x age (at most max_growth_m); after CARRY_S it stays where it is, and
+    its clearance grows on, slowly. The closing speed may not exceed 0.7/s of the distance left; what that
+    takes away is given back to the right-hand side, so that two drones that meet head on pass each other.
     """
     result = np.array(velocity_ned, dtype=np.float64)
-    predicted_ned = others_ned + others_velocity_ned * ages_s[:, None]
-    growth_m = np.minimum(np.linalg.norm(others_velocity_ned, axis=1) * ages_s, max_growth_m)
+    carried_s = np.minimum(ages_s, CARRY_S)
+    predicted_ned = others_ned + others_velocity_ned * carried_s[:, None]
+    growth_m = np.minimum(np.linalg.norm(others_velocity_ned, axis=1) * carried_s, max_growth_m)
+    growth_m = growth_m + np.minimum(DRIFT_M_S * (ages_s - carried_s), DRIFT_MOST_M)
+    others_velocity_ned = np.where((ages_s > CARRY_S)[:, None], 0.0, others_velocity_ned)
     away = own_ned - predicted_ned
     distance_m = np.linalg.norm(away, axis=1)
     # The nearest is looked at last: its word counts most.

@@ -162,8 +162,8 @@ class Navigator:
         memory.state, memory.since_us, memory.reason = target, inputs.utime, event.value
 
     def _clear(self, now: Situation, velocity: Array) -> Array:
-        """`velocity` bent so that the drone keeps clear of every other one in the air."""
-        rows = [row for row in now.others if row.d_m < -1.0]
+        """`velocity` bent so that the drone keeps clear of every other one in the air, heard or silent."""
+        rows = now.obstacles
         if not rows:
             return velocity
         return separate(

@@ -24,6 +24,9 @@ EpisodeKey = tuple[int, int]
 WAITS = "waits for the mission to begin"
 VEHICLE_LIMIT_S = 1.0  # an older vehicle state is doubt
 LINK_LIMIT_S = 2.0  # the autopilot's own heartbeat comes at 1 Hz
+# A drone that is heard no more may still be there, or fly on: kept clear of for so long after its last word.
+OBSTACLE_S = 30.0
+ABOVE_GROUND_M = 1.0
 
 
 @dataclass(frozen=True)
@@ -220,6 +223,27 @@ class Situation:
         rows = self.inputs.fleet.rows if self.inputs.fleet is not None else []
         return sorted(
             (r for r in rows if r.alive and r.id >= 1 and r.id != self.drone_id), key=lambda r: r.id
+        )
+
+    @cached_property
+    def obstacles(self) -> list[podwatch.fleet_row_t]:
+        """Drones to keep clear of: all others in the air, the silent for OBSTACLE_S after their last word.
+
+        By the age of what is known, not by `alive` alone: where this drone's own relay has died, the table
+        itself grows old.
+        """
+        rows = self.inputs.fleet.rows if self.inputs.fleet is not None else []
+        table_s = self.seconds_since(self.inputs.fleet.utime) if self.inputs.fleet is not None else 0.0
+        return sorted(
+            (
+                row
+                for row in rows
+                if row.id >= 1
+                and row.id != self.drone_id
+                and row.d_m < -ABOVE_GROUND_M
+                and (self.row_age_s(row) <= OBSTACLE_S or (row.alive and table_s <= OBSTACLE_S))
+            ),
+            key=lambda row: row.id,
         )
 
     @cached_property

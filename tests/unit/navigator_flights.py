@@ -41,6 +41,7 @@ class Drone:
     position_ok: bool = True
     battery: float = 0.9
     alive: bool = True
+    heard_us: int = 0  # when it was last heard
     said: podwatch.mission_state_t | None = None
     setpoint: podwatch.setpoint_t | None = None
     animal: int = -1
@@ -157,13 +158,14 @@ class Fleet:
     def _row(self, drone: Drone) -> podwatch.fleet_row_t:
         said = drone.said
         assert said is not None
+        drone.heard_us = self.utime if drone.alive else drone.heard_us
         shared = ("state", "animal", "found", "found_n_m", "found_e_m", "pod_radius_m", "waypoint")
         flags = {name: getattr(said, name) for name in (*shared, "on_station", "wants_episode")}
         return make(
             podwatch.fleet_row_t,
             id=drone.id,
             alive=drone.alive,
-            age_ms=200,
+            age_ms=200 + (self.utime - drone.heard_us) // 1000,
             battery=drone.battery,
             n_m=drone.ned[0] - 0.2 * drone.velocity[0],
             e_m=drone.ned[1] - 0.2 * drone.velocity[1],
