@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from procs.registrar._marks import Marks
 
-__all__ = ["Pair", "Prior", "apply_homographies", "wrap_angle"]
+__all__ = ["Pair", "Prior", "apply_homographies", "size_log_ratio", "wrap_angle"]
 
 Array = NDArray[np.float64]
 
@@ -20,10 +20,10 @@ AXIS_SIGMA = 0.22  # rad of the doubled axis angle between two sights of one ani
 AXIS_OUTLIER = (
     0.06  # share of boxes whose proportions mislead: a turned fluke, a splash, another animal's back
 )
-FAR_SHARE, FAR_FACTOR = 0.1, 4.0  # share of animals that moved further than the rest, and by how much
+FAR_SHARE, FAR_FACTOR = 0.01, 3.0  # share of animals that moved further than the rest, and by how much
 BORDER = 0.25  # body sizes over which "inside the other image" fades at its border
 HEADING_OUTLIER = 0.05  # chance that a heading prior is plain wrong
-ANGLE_BINS = 180
+ANGLE_BINS = 60
 
 
 def wrap_angle(angle: Array | float) -> Array:
@@ -33,12 +33,19 @@ def wrap_angle(angle: Array | float) -> Array:
 
 def apply_homographies(homographies: Array, points: Array) -> tuple[Array, Array]:
     """(K, 3, 3) on (N, 2) -> points (K, N, 2) and Jacobians (K, N, 2, 2)."""
-    flat = np.einsum("kab,nb->kna", homographies[:, :, :2], points) + homographies[:, None, :, 2]
-    depth = flat[:, :, 2]
+    flat = points @ homographies[:, :, :2].transpose(0, 2, 1) + homographies[:, None, :, 2]
+    depth = flat[:, :, 2:]
     depth = np.where(np.abs(depth) < 1e-6, 1e-6, depth)
-    mapped = flat[:, :, :2] / depth[:, :, None]
+    mapped = flat[:, :, :2] / depth
     jacobians = homographies[:, None, :2, :2] - mapped[:, :, :, None] * homographies[:, None, 2:, :2]
-    return mapped, jacobians / depth[:, :, None, None]
+    return mapped, jacobians / depth[:, :, :, None]
+
+
+def size_log_ratio(apart: Array) -> Array:
+    """Differences of ln size, any shape -> log-likelihood ratio of one animal against two, same shape."""
+    apart2 = apart * apart
+    far = np.minimum(apart2, 0.4) / (2 * SIZE_SPREAD**2)
+    return np.asarray(np.maximum(np.log(SIZE_SPREAD / SIZE_SIGMA) - apart2 / (2 * SIZE_SIGMA**2) + far, -6.0))
 
 
 @dataclass(frozen=True)
@@ -109,30 +116,28 @@ class Pair:
         """(K, N1, 2) rotated source axes -> (K, N1, N2) log-likelihood ratio of same body against any
         body.
         """
-        best = np.full((len(axes), len(self.source), len(self.target)), np.inf)
-        for a in range(2):
-            for b in range(2):
-                apart = axes[:, :, None, a] - self.target_axes[None, None, :, b]
-                np.minimum(best, apart.real**2 + apart.imag**2, out=best)
+        count, n_source = axes.shape[:2]
+        ours, theirs = axes.reshape(-1), self.target_axes.reshape(-1)
+        apart = ours.real[:, None] - theirs.real
+        apart *= apart
+        across = ours.imag[:, None] - theirs.imag
+        apart += across * across
+        apart = np.minimum(apart[:, 0::2], apart[:, 1::2])
+        best = np.minimum(apart[0::2], apart[1::2]).reshape(count, n_source, len(self.target))
         peak = (1 - AXIS_OUTLIER) * 1.25 / AXIS_SIGMA
         ratio = np.log(peak * np.exp(-best / (2 * AXIS_SIGMA**2)) + AXIS_OUTLIER)
         return np.asarray(ratio * self.axis_weight)
 
     def size_ratio(self, log_sizes: Array) -> Array:
         """(K, N1) ln sizes of the mapped source -> (K, N1, N2) log-likelihood ratio."""
-        apart2 = (log_sizes[:, :, None] - self.log_size_target[None, None, :]) ** 2
-        narrow = (
-            np.log(SIZE_SPREAD / SIZE_SIGMA)
-            - apart2 / (2 * SIZE_SIGMA**2)
-            + np.minimum(apart2, 0.4) / (2 * SIZE_SPREAD**2)
-        )
-        return np.asarray(np.maximum(narrow, -6.0))
+        return size_log_ratio(log_sizes[:, :, None] - self.log_size_target[None, None, :])
 
     def position_ratio(self, mapped: Array, sigma: Array) -> Array:
         """(K, N1, 2) mapped centres, (K,) sigma in body sizes -> (K, N1, N2) log-likelihood ratio."""
-        apart = mapped[:, :, None, :] - self.target.centres[None, None]
         scale2 = (sigma[:, None] * np.exp(self.log_size_target)[None, :]) ** 2
-        chi2 = (apart**2).sum(axis=3) / scale2[:, None, :]
+        east, down = self.target.centres.T
+        chi2 = (mapped[:, :, :1] - east) ** 2 + (mapped[:, :, 1:] - down) ** 2
+        chi2 /= scale2[:, None, :]
         shape = (1 - FAR_SHARE) * np.exp(-chi2 / 2) + FAR_SHARE / FAR_FACTOR**2 * np.exp(
             -chi2 / (2 * FAR_FACTOR**2)
         )

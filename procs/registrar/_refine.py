@@ -19,8 +19,8 @@ Ints = NDArray[np.intp]
 # that moved.
 SIGMAS = (0.8, 0.4, 0.2, 0.1, 0.06)
 SIGMA_PRICES = (12.0, 8.0, 3.0, 0.0, 0.0)  # nats: most views of one instant agree within a tenth of a body
-KEPT_AFTER = (20, 10, 8, 6, 6)  # starting points that go on to the next sigma
-FITS_PER_SIGMA = 2
+KEPT_AFTER = (10, 8, 6, 4, 4)  # starting points that go on to the next sigma
+FITS_PER_SIGMA = 1
 SHEAR_STD = 0.07  # of what two tilted cameras shear, as a share of the scale
 PERSPECTIVE_STD = 0.16  # of the perspective terms of two tilted cameras, over the width of a view
 SCALE_SLACK_STD = 0.5  # keeps scale and turn where too few matches fix them
@@ -38,12 +38,23 @@ class Candidate:
     sigma: float
 
 
+def _carried_shapes(jacobians: Array, shapes: Array) -> tuple[Array, NDArray[np.complex128]]:
+    """Jacobians (K, N, 2, 2) on shapes (N, 2, 2, 2) -> trace and doubled axis angle, (K, N, 2) each; written
+    out, since this is the inner loop.
+    """
+    a, b, c, d = (jacobians[:, :, row, column, None] for row in (0, 1) for column in (0, 1))
+    width2, cross, height2 = shapes[:, :, 0, 0], shapes[:, :, 0, 1], shapes[:, :, 1, 1]
+    across = a * a * width2 + 2 * a * b * cross + b * b * height2
+    down = c * c * width2 + 2 * c * d * cross + d * d * height2
+    both = a * c * width2 + (a * d + b * c) * cross + b * d * height2
+    trace = np.maximum(across + down, 1e-12)
+    return trace, ((across - down) + 2j * both) / trace
+
+
 def _evaluate(pair: Pair, homographies: Array, sigma: Array) -> tuple[Array, Array]:
     """Gains (K, N1, N2) of matching over leaving alone, and the score (K,) of leaving everything alone."""
     mapped, jacobians = apply_homographies(homographies, pair.source.centres)
-    shapes = np.einsum("knab,ncbd,kned->kncae", jacobians, pair.source.shapes, jacobians)
-    trace = np.maximum(shapes[..., 0, 0] + shapes[..., 1, 1], 1e-12)
-    axes = ((shapes[..., 0, 0] - shapes[..., 1, 1]) + 2j * shapes[..., 0, 1]) / trace
+    trace, axes = _carried_shapes(jacobians, pair.source.shapes)
     inside_source, inside_target = pair.insideness(homographies, mapped)
     price_source, price_target = inside_source * pair.source.prices, inside_target * pair.target.prices
     gains = pair.position_ratio(mapped, sigma) + pair.axis_ratio(axes)
@@ -81,8 +92,9 @@ def _normal_equations(
     design[:, :, 0, 1] = design[:, :, 1, 4] = -x[:, 1]
     design[:, :, 0, 2] = design[:, :, 1, 3] = 1.0
     design[:, :, :, 6:] = -goal[:, :, :, None] * x[None, :, None, :]
-    matrix = np.einsum("knra,kn,knrb->kab", design, weights, design)
-    right = np.einsum("knra,kn,knr->ka", design, weights, goal)
+    weighted = (design * weights[:, :, None, None]).reshape(len(columns), -1, 8).transpose(0, 2, 1)
+    matrix = weighted @ design.reshape(len(columns), -1, 8)
+    right = (weighted @ goal.reshape(len(columns), -1, 1))[:, :, 0]
     return matrix, right, weights
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from procs.registrar._pair import ANGLE_BINS, Pair, wrap_angle
+from procs.registrar._pair import ANGLE_BINS, Pair, size_log_ratio, wrap_angle
 
 __all__ = ["find_similarities"]
 
@@ -13,9 +13,11 @@ Complex = NDArray[np.complex128]
 COARSE_SIGMA = (
     0.5  # body sizes: a similarity misses the tilt of two cameras by about this at the image's edge
 )
+MOST_GAINED = 2.5  # nats that the best size and axis add to a match
 LOG_SCALE_GATE = 0.45  # |ln| between the scale of a pair's distance and of its sizes
-MAX_SCORED = 800
+MAX_SCORED = 500
 MAX_KEPT = 48
+KEPT_MARGIN = 30.0  # nats
 
 
 def _complex(points: Array) -> Complex:
@@ -85,15 +87,20 @@ def _coarse_scores(pair: Pair, alpha: Complex, beta: Complex) -> Array:
     """(H,) sum over the marks of each view of the best log-likelihood ratio that another mark gives it."""
     zs, zt = _complex(pair.source.centres), _complex(pair.target.centres)
     mapped = alpha[:, None] * zs + beta[:, None]
-    apart = mapped[:, :, None] - zt
+    # Single precision, and the dear terms only for the few pairs that are near enough to gain anything.
+    apart = mapped.astype(np.complex64)[:, :, None] - zt.astype(np.complex64)
+    chi2 = apart.real**2 + apart.imag**2
     sigma2 = (COARSE_SIGMA * np.exp(pair.log_size_target)) ** 2
-    ratio = np.log(pair.area / (2 * np.pi * sigma2)) - (apart.real**2 + apart.imag**2) / (2 * sigma2)
-    ratio += pair.axis_table[_angle_bins(alpha)]
-    ratio += pair.size_ratio(pair.log_size_source[None] + np.log(np.abs(alpha))[:, None])
-    np.maximum(ratio, 0.0, out=ratio)
-    total = ratio.max(axis=2).sum(axis=1) + ratio.max(axis=1).sum(axis=1)
-    homographies = _homographies(alpha, beta)
-    return np.asarray(total / 2 + pair.transform_prior(homographies))
+    chi2 /= 2 * sigma2.astype(np.float32)
+    h, row, column = np.nonzero(chi2 < np.log(pair.area / (2 * np.pi * sigma2.min())) + MOST_GAINED)
+    log_scale = np.log(np.maximum(np.abs(alpha), 1e-9))
+    gain = np.log(pair.area / (2 * np.pi * sigma2))[column] - chi2[h, row, column]
+    gain += pair.axis_table[_angle_bins(alpha)[h], row, column]
+    gain += size_log_ratio(pair.log_size_source[row] + log_scale[h] - pair.log_size_target[column])
+    ratio = np.zeros(chi2.shape, dtype=np.float32)
+    ratio[h, row, column] = np.maximum(gain, 0.0)
+    total = ratio.max(axis=2).sum(axis=1, dtype=np.float64) + ratio.max(axis=1).sum(axis=1, dtype=np.float64)
+    return np.asarray(total / 2 + pair.transform_prior(_homographies(alpha, beta)))
 
 
 def _homographies(alpha: Complex, beta: Complex) -> Array:
@@ -124,6 +131,7 @@ def find_similarities(pair: Pair) -> Array:
     beta = np.concatenate([beta, *[one for _, one in extra]])
     scores = _coarse_scores(pair, alpha, beta)
     order = np.argsort(-scores, kind="stable")[: 8 * MAX_KEPT]
+    order = order[scores[order] > scores[order[0]] - KEPT_MARGIN]
     return _homographies(*_distinct(pair, alpha[order], beta[order]))
 
 
