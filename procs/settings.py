@@ -13,6 +13,7 @@ from typing import Any, ClassVar, Literal, Self, TypeVar
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 __all__ = [
+    "AssignSettings",
     "CameraSettings",
     "DriverSpec",
     "DroneSettings",
@@ -86,6 +87,13 @@ class WatchSettings(Section):
     episode_limit_s: float = Field(5.0, ge=2, le=20)
 
 
+class AssignSettings(Section):
+    """Who watches which animal."""
+
+    gain_m: float = Field(5.0, ge=0, le=500)  # saved for each drone that changes its animal
+    minute_watched_m: float = Field(1.0, ge=0, le=100)  # an animal is so much dearer a minute watched by any
+
+
 class LimitSettings(Section):
     """What no setpoint may exceed; the bridge clamps to it at the last hop."""
 
@@ -137,6 +145,7 @@ class Mission(Section):
     camera: CameraSettings = CameraSettings()
     search: SearchSettings = SearchSettings()
     watch: WatchSettings = WatchSettings()
+    assign: AssignSettings = AssignSettings()
     limits: LimitSettings = LimitSettings()
     radio: RadioSettings = RadioSettings()
 

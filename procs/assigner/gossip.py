@@ -276,7 +276,8 @@ def _own_row(costs: NDArray[np.float64], goals: list[int], previous: int, listed
     """The row that an agent says of itself; `listed`: as in Agent."""
     kept = list(range(len(goals)))
     if listed is not None and listed < len(goals):
-        near = np.argsort(costs, kind="stable")[:listed].tolist()
-        kept = [k for k in kept if k in near or goals[k] == previous or np.isinf(costs[k])]
+        must = [k for k in kept if goals[k] == previous or np.isinf(costs[k])]
+        near = [k for k in np.argsort(costs, kind="stable").tolist() if k not in must]
+        kept = sorted(must + near[: max(0, listed - len(must))])
     codes = tuple(int(code) for code in cost_codes(costs[kept]))
     return Row(tuple(goals[k] for k in kept), codes, previous, is_cut=len(kept) < len(goals))
