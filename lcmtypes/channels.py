@@ -64,7 +64,10 @@ CHANNELS = (
 WORLD_STATE = "WORLD_STATE"
 WORLD_COMMAND = "WORLD_COMMAND"  # JSON, from the run's own tool: begin, faults
 WORLD_CHANNELS = (Channel(WORLD_STATE, podwatch.world_state_t, rate_hz=50),)
-BY_NAME = {channel.name: channel for channel in (*CHANNELS, *WORLD_CHANNELS)}
+# What only a log holds: the pixels of a FRAME, whole, kept by the logger with `--log-frames`; on no bus.
+IMAGE = "IMAGE"
+LOG_CHANNELS = (Channel(IMAGE, podwatch.preview_t, rate_hz=20),)
+BY_NAME = {channel.name: channel for channel in (*CHANNELS, *WORLD_CHANNELS, *LOG_CHANNELS)}
 CROSSING = tuple(channel for channel in CHANNELS if channel.crosses)
 
 

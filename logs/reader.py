@@ -3,6 +3,7 @@
 Any damage is survived: what is whole is read, what is not gets one LogWarning that says what is missing.
 """
 
+import glob
 import os
 import struct
 import warnings
@@ -17,9 +18,9 @@ from logs.exceptions import LogError, LogWarning
 from logs.scan import RawMessage, Scan
 from logs.schemas import PACKAGE, fingerprint
 from logs.sequence import GapCounter
-from logs.writer import METADATA
+from logs.writer import METADATA, picture_path
 
-__all__ = ["ChannelInfo", "LogInfo", "info", "read", "segments"]
+__all__ = ["ChannelInfo", "LogInfo", "info", "pictures", "read", "segments"]
 
 PathLike = str | os.PathLike[str]
 
@@ -97,12 +98,24 @@ def info(path: PathLike) -> LogInfo:
 
 
 def segments(path: PathLike) -> list[Path]:
-    """The log at `path` and those that respawned loggers wrote beside it: name.1.mcap, name.2.mcap, ..."""
+    """The files of one log in their order: `path` and what goes on behind it, name.1.mcap, name.2.mcap, ...
+
+    A logger that was restarted, or that begins a new file now and then, numbers them on; the oldest may have
+    been dropped for room. `path` alone where there are none.
+    """
     first = Path(path)
-    found = [first]
-    while (following := first.with_name(f"{first.stem}.{len(found)}{first.suffix}")).exists():
-        found.append(following)
-    return found
+    numbered = {0: first} if first.exists() else {}
+    for other in first.parent.glob(f"{glob.escape(first.stem)}.*{first.suffix}"):
+        number = other.stem.removeprefix(f"{first.stem}.")
+        if number.isdigit():
+            numbered[int(number)] = other
+    return [numbered[number] for number in sorted(numbered)] or [first]
+
+
+def pictures(path: PathLike) -> list[Path]:
+    """The files beside a log that hold its drone's pictures, where its logger kept them apart."""
+    first = Path(path)
+    return [found for found in segments(picture_path(first)) if found.exists()]
 
 
 class _Tally:

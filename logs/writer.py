@@ -1,5 +1,6 @@
 """Writes a drone's bus to an MCAP file: raw LCM bytes, and all that a reader needs to decode them."""
 
+import glob
 import os
 from collections.abc import Mapping
 from functools import cache
@@ -13,7 +14,7 @@ from logs.exceptions import LogError
 from logs.schemas import fingerprint, lcm_text, type_name
 from logs.sequence import read_head
 
-__all__ = ["ENCODING", "FLUSH_PERIOD_US", "METADATA", "LogWriter", "fresh_path"]
+__all__ = ["ENCODING", "FLUSH_PERIOD_US", "METADATA", "LogWriter", "fresh_path", "picture_path"]
 
 ENCODING = "lcm"  # of messages and of schemas
 METADATA = "podwatch"  # name of the MCAP metadata record that tells whose log it is
@@ -25,12 +26,21 @@ MAX_TIME_US = (2**63 - 1) // 1000
 
 
 def fresh_path(path: Path) -> Path:
-    """`path`, or where it exists the first free of name.1.mcap, name.2.mcap, ...: nothing is overwritten."""
-    candidate, number = path, 0
-    while candidate.exists():
-        number += 1
-        candidate = path.with_name(f"{path.stem}.{number}{path.suffix}")
-    return candidate
+    """`path`, or where the log has files already the next of name.1.mcap, name.2.mcap, ...
+
+    Nothing is overwritten, and a number that was dropped for room is not used again.
+    """
+    taken = [
+        other.stem.removeprefix(f"{path.stem}.")
+        for other in path.parent.glob(f"{glob.escape(path.stem)}.*{path.suffix}")
+    ]
+    last = max((int(number) for number in taken if number.isdigit()), default=0 if path.exists() else None)
+    return path if last is None else path.with_name(f"{path.stem}.{last + 1}{path.suffix}")
+
+
+def picture_path(path: Path) -> Path:
+    """Where the pictures of the log at `path` are kept, if not in it: name.pictures.mcap."""
+    return path.with_name(f"{path.stem}.pictures{path.suffix}")
 
 
 class _AppendedFile:

@@ -132,7 +132,8 @@ def test_each_process_of_the_table_is_a_module_with_its_page_and_its_setup(proce
 
 
 def test_names_of_channels_and_processes_are_unique():
-    assert len(channels.BY_NAME) == len(channels.CHANNELS) + len(channels.WORLD_CHANNELS)
+    elsewhere = (*channels.WORLD_CHANNELS, *channels.LOG_CHANNELS)
+    assert len(channels.BY_NAME) == len(channels.CHANNELS) + len(elsewhere)
     assert len(processes.BY_NAME) == len(processes.PROCESSES)
     constants = {name for name in vars(channels) if name.isupper() and name in channels.BY_NAME}
     assert constants == set(channels.BY_NAME)

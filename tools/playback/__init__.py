@@ -1,0 +1,1 @@
+"""Recorded logs on real buses again: `podwatch play`."""
