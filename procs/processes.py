@@ -7,7 +7,7 @@ __all__ = ["BY_NAME", "PROCESSES", "Process", "Restart"]
 
 
 class Restart(Enum):
-    """What the supervisor does when a process ends."""
+    """What the supervisor does when a process ends or hangs."""
 
     ALWAYS = "always"
     NEVER = "never"
@@ -18,8 +18,9 @@ class Process:
     """One process of a drone.
 
     `compute_s` is the nominal time of one handler: it delays the process's outputs in virtual time.
-    `stop_order`: the lowest is stopped first, so that the bridge still hears the navigator and the logger
-    hears everybody.
+    `heartbeat_limit_s`: one that is silent for longer hangs, and its supervisor ends it, to start it again (a
+    simulated fleet's is three times as patient). `stop_order`: the lowest is stopped first, so that the
+    bridge still hears the navigator and the logger hears everybody.
     """
 
     name: str

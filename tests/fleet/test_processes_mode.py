@@ -14,7 +14,7 @@ import time
 import warnings
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -28,11 +28,13 @@ from logs.exceptions import LogWarning
 from logs.reader import info, read, segments
 from procs import processes
 from procs.navigator.states import State
+from procs.processes import Restart
 from procs.relay.keys import make_key
 from tests.fleet.conftest import new_plan
 from tools.judge import Verdict, judge, load_run
 from tools.sim import processes as process_mode
 from tools.sim.buses import N_SLOTS, Slot
+from tools.sim.heartbeats import Hung
 from tools.sim.plan import RunPlan
 from tools.sim.processes import SHARED_FOLDER, ProcessFleet
 from tools.sim.run import fly_lockstep, write_truth_notes
@@ -42,6 +44,7 @@ from tools.sim.watch import Watch
 pytestmark = pytest.mark.timeout(600)
 
 VICTIM = 2
+HUNG_DRONE, HUNG_PROCESS = 3, "assigner"  # stopped in the air, not killed: only its heartbeats are missed
 # The eyes and the memory are killed on the way: dead within the watch, they would take from the judge what he
 # looks at.
 KILLED_ON_THE_WAY = ("camera", "detector", "tracker", "logger", "registrar", "assigner", "relay")
@@ -54,12 +57,27 @@ LEAST_DISTINCT_SHARE = 0.8
 RATE_TOLERANCE = 0.35
 
 
+def boot_time_s() -> float:
+    """The clock by which the kernel says when a process was started."""
+    return time.clock_gettime(time.CLOCK_BOOTTIME)
+
+
+def started_at_s(pid: int) -> float:
+    """When a process was started, to 0.01 s."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
+    return int(fields[19]) / os.sysconf("SC_CLK_TCK")
+
+
 @dataclass
 class Killer:
     """The run's screen: kills one process of the victim after another, when the one before has come back."""
 
     pids: dict[str, int] = field(default_factory=dict)  # newest pid of each of the victim's processes
-    respawn_s: dict[str, float] = field(default_factory=dict)
+    respawn_s: dict[str, float] = field(default_factory=dict)  # until it beat again
+    started_s: dict[str, float] = field(default_factory=dict)  # until there was a process again
+    hung_pids: list[int] = field(default_factory=list)  # of the process that is stopped, one after another
+    is_hung: bool = False
+    notes: list[str] = field(default_factory=list)
     states: dict[int, State] = field(default_factory=dict)
     waiting: str = ""
     killed_s: float = 0.0
@@ -71,16 +89,23 @@ class Killer:
         elif channel == channels.HEARTBEAT and drone_id == VICTIM:
             self.pids[message.process] = message.pid
             if message.process == self.waiting and message.pid != self.killed_pid:
-                self.respawn_s[self.waiting] = time.monotonic() - self.killed_s
+                self.respawn_s[self.waiting] = boot_time_s() - self.killed_s
+                self.started_s[self.waiting] = started_at_s(message.pid) - self.killed_s
                 self.waiting = ""
+        elif channel == channels.HEARTBEAT and (drone_id, message.process) == (HUNG_DRONE, HUNG_PROCESS):
+            if message.pid not in self.hung_pids:
+                self.hung_pids.append(message.pid)
 
     def note(self, _now_s: float, text: str) -> None:
-        raise AssertionError(f"the mission names no fault, but: {text}")
+        self.notes.append(text)
 
     def tick(self, _now_s: float, _realtime_factor: float) -> None:
         """Kill the next one when it is time."""
+        if not self.is_hung and self.hung_pids and self.states.get(HUNG_DRONE) == State.STANDBY:
+            self.is_hung = True
+            os.kill(self.hung_pids[0], signal.SIGSTOP)
         if self.waiting:
-            waited_s = time.monotonic() - self.killed_s
+            waited_s = boot_time_s() - self.killed_s
             assert waited_s < RESPAWN_LIMIT_S, f"{self.waiting} has not come back for {waited_s:.0f} s"
             return
         victim = self.states.get(VICTIM, State.IDLE)
@@ -90,7 +115,7 @@ class Killer:
             due += KILLED_WHILE_WATCHING
         left = [name for name in due if name not in self.respawn_s]
         if left:
-            self.waiting, self.killed_pid, self.killed_s = left[0], self.pids[left[0]], time.monotonic()
+            self.waiting, self.killed_pid, self.killed_s = left[0], self.pids[left[0]], boot_time_s()
             os.kill(self.killed_pid, signal.SIGKILL)
 
 
@@ -151,7 +176,18 @@ def is_alive(process: psutil.Process) -> bool:
 
 def test_every_process_of_a_drone_comes_back_from_kill_9(flight, record_property):
     record_property("respawn_s", flight.respawn_s)
+    record_property("started_s", flight.screen.started_s)
+    for name in flight.respawn_s:
+        print(f"{name}: started {flight.screen.started_s[name]:.2f} s after its kill, beat after ", end="")
+        print(f"{flight.respawn_s[name]:.2f} s")
     assert sorted(flight.respawn_s) == sorted(processes.BY_NAME)
+
+
+def test_a_process_that_hangs_is_killed_and_comes_back_and_no_other_is_taken_for_hung(flight):
+    assert len(flight.screen.hung_pids) == 2
+    assert [note.split(" (")[0] for note in flight.screen.notes] == [
+        f"{HUNG_PROCESS} of drone {HUNG_DRONE} hangs"
+    ]
 
 
 def test_the_drone_whose_processes_were_killed_ends_on_the_ground_like_the_others(flight):
@@ -235,7 +271,7 @@ class NoSupervisor:
 
     def stop(self) -> None: ...
 
-    def check(self) -> None: ...
+    def check(self, *, in_flight: bool = False) -> None: ...
 
 
 @pytest.fixture
@@ -251,6 +287,29 @@ def laid_out(near: SimMission, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     yield lay_out
     for fleet in fleets:
         fleet.close()
+
+
+@pytest.mark.parametrize("state", [State.IDLE, State.MONITOR])
+@pytest.mark.parametrize("policy", list(Restart))
+def test_a_process_that_hangs_is_ended_by_its_policy_and_only_if_it_is_still_that_process(
+    state, policy, laid_out, monkeypatch
+):
+    fleet = laid_out("run")
+    name = "restart_ground" if state == State.IDLE else "restart_air"
+    other = "restart_air" if state == State.IDLE else "restart_ground"
+    opposite = Restart.NEVER if policy is Restart.ALWAYS else Restart.ALWAYS
+    row = replace(processes.BY_NAME["tracker"], **{name: policy, other: opposite})
+    monkeypatch.setitem(processes.BY_NAME, "tracker", row)
+    fleet._watch.states[1] = state
+    with subprocess.Popen(["cat"], stdin=subprocess.PIPE) as sleeper:
+        fleet.supervisor.states = lambda: {"tracker_1": ("RUNNING", sleeper.pid)}
+        fleet._end(Hung(1, "tracker", sleeper.pid + 1, 12.0))
+        assert sleeper.poll() is None, "it was started again meanwhile"
+        fleet._end(Hung(1, "tracker", sleeper.pid, 12.0))
+        if policy is Restart.ALWAYS:
+            assert sleeper.wait(timeout=10) == -signal.SIGKILL
+        else:
+            assert sleeper.poll() is None
 
 
 def test_two_runs_at_once_share_no_bus_no_port_and_no_memory_and_never_hear_each_other(laid_out):

@@ -2,9 +2,12 @@
 radios on loopback.
 """
 
+import contextlib
 import json
+import os
 import secrets
 import select
+import signal
 import time
 from collections.abc import Callable
 from functools import partial
@@ -18,8 +21,11 @@ from drivers.sim.remote import world_url
 from lcmtypes import channels
 from lcmtypes.podwatch import heartbeat_t
 from procs import processes
+from procs.navigator.states import State
+from procs.processes import Restart
 from procs.settings import DriverSpec, DroneSettings
 from tools.sim.buses import Slot, bus_url, free_udp_ports
+from tools.sim.heartbeats import HeartbeatGuard, Hung
 from tools.sim.plan import RunPlan
 from tools.sim.supervision import Supervisor, SupervisorError, program
 from tools.sim.watch import Watch
@@ -53,6 +59,7 @@ class ProcessFleet:
         self._radio_ports = dict(zip(roster, ports[len(roster) :], strict=False))
         self._ether_ports = dict(zip(roster, ports[2 * len(roster) :], strict=False))
         self._heard: set[str] = set()
+        self._guard = HeartbeatGuard()
         self._world = lcm.LCM(world_url(self._slot.number))
         self._buses = [self._listen(drone_id) for drone_id in roster]
         self._page_path = SHARED_FOLDER / f"podwatch_{self._run}_clock"
@@ -93,11 +100,13 @@ class ProcessFleet:
         self._in_flight = True
 
     def look(self) -> None:
-        """Hear what waits on the buses; now and then see whether the tree still stands."""
+        """Hear what waits on the buses; end what hangs; now and then see whether the tree still stands."""
         ready, _, _ = select.select(self._buses, [], [], LOOK_S)
         for bus in ready:
             while bus.handle_timeout(0) > 0:
                 pass
+        for hung in self._guard.look(time.monotonic(), self.now_s):
+            self._end(hung)
         if time.monotonic() >= self._next_check:
             self._next_check = time.monotonic() + CHECK_EVERY_S
             self.supervisor.check(in_flight=self._in_flight)
@@ -117,9 +126,27 @@ class ProcessFleet:
     def kill(self, drone_id: int) -> None:
         """The whole drone, vehicle and processes."""
         self._command(kind="kill", drone=drone_id)
+        self._guard.forget(drone_id)
         names = {program(drone_id, process.name) for process in processes.PROCESSES}
         pids = [pid for name, (_, pid) in self.supervisor.states().items() if name in names]
         self.supervisor.drop_drone(drone_id, pids)
+
+    def _end(self, hung: Hung) -> None:
+        """Kill a process that hangs, so that supervisord starts it again; not one that the table says is
+        never started again.
+        """
+        row = processes.BY_NAME[hung.process]
+        on_ground = self._watch.states.get(hung.drone_id, State.IDLE) in (State.IDLE, State.LANDED)
+        if (row.restart_ground if on_ground else row.restart_air) is not Restart.ALWAYS:
+            return
+        _, pid = self.supervisor.states().get(program(hung.drone_id, hung.process), ("", 0))
+        if pid == hung.pid:  # else it has ended meanwhile, and its number may be another's
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+            self._watch.note(
+                f"{hung.process} of drone {hung.drone_id} hangs (no heartbeat for {hung.silent_s:.0f} s): "
+                "killed, to be started again"
+            )
 
     def _listen(self, drone_id: int) -> Any:
         bus = lcm.LCM(bus_url(drone_id, self._slot.number))
@@ -128,8 +155,10 @@ class ProcessFleet:
         return bus
 
     def _hear(self, drone_id: int, channel: str, data: bytes) -> None:
-        if channel == channels.HEARTBEAT and len(self._heard) < 1000:
-            self._heard.add(program(drone_id, heartbeat_t.decode(data).process))
+        if channel == channels.HEARTBEAT:
+            beat = heartbeat_t.decode(data)
+            self._heard.add(program(drone_id, beat.process))
+            self._guard.beat(drone_id, beat.process, beat.pid)
         self._watch.hear(drone_id, channel, data)
 
     def _command(self, **command: Any) -> None:

@@ -72,8 +72,7 @@ class Watch:
         self.now_s = now_s
         marked = _Marked(victim, self)
         for text in self._faults.step(now_s, marked):
-            if self._screen is not None:
-                self._screen.note(now_s, text)
+            self.note(text)
         if self._screen is not None:
             self._screen.tick(now_s, realtime_factor)
         return self._is_over(now_s)
@@ -88,6 +87,11 @@ class Watch:
         if self._down_since_s is None:
             self._down_since_s = now_s
         return now_s - self._down_since_s >= OVER_AFTER_S
+
+    def note(self, text: str) -> None:
+        """Something befell the run."""
+        if self._screen is not None:
+            self._screen.note(self.now_s, text)
 
     def died(self, drone_id: int) -> None:
         """A drone is dead: nobody waits for it."""
