@@ -13,13 +13,14 @@ from typing import Any
 
 from lcmtypes import channels, make
 from lcmtypes.channels import Channel
-from lcmtypes.podwatch import fleet_state_t, link_state_t, mission_state_t, vehicle_state_t
+from lcmtypes.podwatch import episode_t, fleet_state_t, link_state_t, mission_state_t, vehicle_state_t
 from procs.relay import datagram
 from procs.relay.budget import ByteWindow, Message
 from procs.relay.clock_sync import FleetClock
 from procs.relay.fleet import TABLE_LIMIT_BYTES, FleetTable
 from procs.relay.link import LINK_KIND, Link
 from procs.relay.members import BOAT_ID, Members, Neighbours
+from procs.relay.passing import PASSED_ON, EpisodeRoll
 from procs.relay.rows import Marker, Row
 from procs.relay.seal import MAX_OVERHEAD_BYTES, Refusal, RefusedError, Sessions
 
@@ -76,6 +77,7 @@ class Relay:
         self.sessions = Sessions(fleet_key, own_id, session, self.members.ids)
         self.fleet = FleetTable(own_id, self.members.ids)
         self.fleet_clock = FleetClock(own_id, len(roster), now_us)
+        self._roll = EpisodeRoll(roster.index(own_id) if own_id in roster else None)
         self.refused: dict[Refusal, int] = {}  # arrivals that were not believed, by reason, since start
         self._send_to_radio = send
         reserved = self._own_bytes_per_s(bytes_per_s)
@@ -118,6 +120,8 @@ class Relay:
             raise ValueError(
                 f"{channel.name} of {len(data)} bytes: at most {self.encoded_limit_bytes} may cross"
             )
+        if channel.name == channels.RING_EPISODE:
+            self._roll.hear(episode_t.decode(data))
         message = Message(channel, data, utime, payload_bytes)
         for peer_id in self.members.neighbours(now_us).ids:
             self.links[peer_id].queue.offer(message)
@@ -300,7 +304,21 @@ class Relay:
         if abs(age_us) > channel.max_age_s * 1e6:
             self._refuse(Refusal.STALE, link.peer_id)
             return None
+        if channel.name == channels.RING_EPISODE:
+            self._roll.hear(message)
+        elif channel.name in PASSED_ON and self._roll.is_bystander(message):
+            self._pass_on(link, channel, message, now_us - age_us, now_us)
         return Copy(link.peer_id, channel, part.data)
+
+    def _pass_on(self, link: Link, channel: Channel, message: Any, said_us: int, now_us: int) -> None:
+        """Hand a neighbour's message on to the neighbour on the other side, as this drone's word, by its
+        clock."""
+        message.drone_id, message.utime = self.own_id, said_us
+        handed_on = Message(channel, message.encode(), said_us, len(message.packet))
+        for peer_id in self.members.neighbours(now_us).ids:
+            if peer_id != link.peer_id:
+                self.links[peer_id].queue.offer(handed_on)
+        self.pump(now_us)
 
     def _refuse(self, reason: Refusal, sender: int | None) -> None:
         self.refused[reason] = self.refused.get(reason, 0) + 1
