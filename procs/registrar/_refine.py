@@ -7,7 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
+from scipy.special import betaln
 
+from procs.registrar._marks import DETECTION_PRICE
 from procs.registrar._pair import Pair, apply_homographies, similarity_part
 
 __all__ = ["Candidate", "refine"]
@@ -20,7 +22,10 @@ Ints = NDArray[np.intp]
 SIGMAS = (0.8, 0.4, 0.2, 0.1, 0.06)
 SIGMA_PRICES = (12.0, 8.0, 3.0, 0.0, 0.0)  # nats: most views of one instant agree within a tenth of a body
 KEPT_AFTER = (10, 8, 6, 4, 4)  # starting points that go on to the next sigma
-FITS_PER_SIGMA = 1
+N_DOUBTED, DOUBTS, LEAST_DOUBTED = 3, 4, 3  # matchings, matches of each, and how many it needs for that
+DOUBTED_GAIN = 14.0  # nats; a match that gains more is no chance
+DOUBT_LEVELS = (3, 4)  # of SIGMAS
+RELIABILITY = (4.0, 0.5)  # of the detector beforehand, as boxes with and without a partner
 SHEAR_STD = 0.07  # of what two tilted cameras shear, as a share of the scale
 PERSPECTIVE_STD = 0.16  # of the perspective terms of two tilted cameras, over the width of a view
 SCALE_SLACK_STD = 0.5  # keeps scale and turn where too few matches fix them
@@ -47,12 +52,12 @@ def _carried_shapes(jacobians: Array, shapes: Array) -> tuple[Array, NDArray[np.
     across = a * a * width2 + 2 * a * b * cross + b * b * height2
     down = c * c * width2 + 2 * c * d * cross + d * d * height2
     both = a * c * width2 + (a * d + b * c) * cross + b * d * height2
-    trace = np.maximum(across + down, 1e-12)
-    return trace, ((across - down) + 2j * both) / trace
+    trace = np.asarray(np.maximum(across + down, 1e-12), dtype=np.float64)
+    return trace, np.asarray(((across - down) + 2j * both) / trace)
 
 
-def _evaluate(pair: Pair, homographies: Array, sigma: Array) -> tuple[Array, Array]:
-    """Gains (K, N1, N2) of matching over leaving alone, and the score (K,) of leaving everything alone."""
+def _evaluate(pair: Pair, homographies: Array, sigma: Array) -> tuple[Array, Array, Array]:
+    """Gains (K, N1, N2) of matching over leaving alone, and the prices of leaving alone, (K, N1), (K, N2)."""
     mapped, jacobians = apply_homographies(homographies, pair.source.centres)
     trace, axes = _carried_shapes(jacobians, pair.source.shapes)
     inside_source, inside_target = pair.insideness(homographies, mapped)
@@ -60,7 +65,21 @@ def _evaluate(pair: Pair, homographies: Array, sigma: Array) -> tuple[Array, Arr
     gains = pair.position_ratio(mapped, sigma) + pair.axis_ratio(axes)
     gains += pair.size_ratio(np.log(trace.mean(axis=2)) / 2)
     gains += price_source[:, :, None] + price_target[:, None, :]
-    return gains, -(price_source.sum(axis=1) + price_target.sum(axis=1))
+    return gains, price_source, price_target
+
+
+def _count_evidence(columns: Ints, price_source: Array, price_target: Array) -> Array:
+    """(K,) log evidence of how many boxes found a partner and how many did not, for a detector of unknown
+    reliability: the first miss costs the most, for each makes the next more credible. Boxes outside the
+    other view count as little as their price says.
+    """
+    is_source = columns >= 0
+    is_target = (columns[:, :, None] == np.arange(price_target.shape[1])).any(axis=1)
+    both = np.concatenate([price_source, price_target], axis=1) / DETECTION_PRICE
+    is_matched = np.concatenate([is_source, is_target], axis=1)
+    matched, alone = np.where(is_matched, both, 0.0).sum(axis=1), np.where(is_matched, 0.0, both).sum(axis=1)
+    seen, missed = RELIABILITY
+    return np.asarray(betaln(matched + seen, alone + missed) - betaln(seen, missed))
 
 
 def _assign(gains: Array) -> Ints:
@@ -143,28 +162,65 @@ def _best_distinct(columns: Ints, scores: Array, n_kept: int) -> list[int]:
     return list(seen.values())[:n_kept]
 
 
-def refine(pair: Pair, homographies: Array) -> list[Candidate]:
-    """Distinct matchings from starting similarities (K, 3, 3), by falling log evidence."""
-    best: dict[tuple[int, ...], Candidate] = {}
-    for level, price, n_kept in zip(SIGMAS, SIGMA_PRICES, KEPT_AFTER, strict=True):
-        sigma = np.full(len(homographies), level)
-        for _ in range(FITS_PER_SIGMA):
-            gains, _ = _evaluate(pair, homographies, sigma)
-            columns = _assign(gains)
-            homographies, evidence = _fit(pair, homographies, columns, sigma)
-        gains, alone = _evaluate(pair, homographies, sigma)
+class _Found:
+    """The matchings that were met, each with its best score."""
+
+    def __init__(self, pair: Pair) -> None:
+        self._pair = pair
+        self.best: dict[tuple[int, ...], Candidate] = {}
+
+    def settle(self, homographies: Array, columns: Ints, level: int) -> tuple[Array, Ints, Array]:
+        """Fit, match anew and note what was found -> homographies (K, 3, 3), columns (K, N1), scores (K,)."""
+        pair = self._pair
+        sigma = np.full(len(homographies), SIGMAS[level])
+        homographies, evidence = _fit(pair, homographies, columns, sigma)
+        gains, price_source, price_target = _evaluate(pair, homographies, sigma)
         columns = _assign(gains)
-        kept = np.where(
-            columns >= 0, np.take_along_axis(gains, np.maximum(columns, 0)[:, :, None], axis=2)[:, :, 0], 0.0
-        )
-        scores = kept.sum(axis=1) + alone + evidence + pair.transform_prior(homographies) - price
+        likelihood = gains - price_source[:, :, None] - price_target[:, None, :]
+        kept = np.take_along_axis(likelihood, np.maximum(columns, 0)[:, :, None], axis=2)[:, :, 0]
+        scores = np.where(columns >= 0, kept, 0.0).sum(axis=1) + evidence + pair.transform_prior(homographies)
+        scores = scores + _count_evidence(columns, price_source, price_target)
+        scores = scores - SIGMA_PRICES[level]
         for index in range(len(homographies)):
             if not (columns[index] >= 0).any():
                 continue  # two views of one scene share an animal, or there is nothing to find
             key = tuple(columns[index].tolist())
-            if key not in best or scores[index] > best[key].score:
-                best[key] = Candidate(
-                    columns[index], float(scores[index]), homographies[index], gains[index], level
+            if key not in self.best or scores[index] > self.best[key].score:
+                self.best[key] = Candidate(
+                    columns[index], float(scores[index]), homographies[index], gains[index], SIGMAS[level]
                 )
+        return homographies, columns, scores
+
+    def ordered(self) -> list[Candidate]:
+        return sorted(self.best.values(), key=lambda one: -one.score)
+
+
+def refine(pair: Pair, homographies: Array) -> list[Candidate]:
+    """Distinct matchings from starting similarities (K, 3, 3), by falling log evidence."""
+    found = _Found(pair)
+    for level, n_kept in enumerate(KEPT_AFTER):
+        sigma = np.full(len(homographies), SIGMAS[level])
+        columns = _assign(_evaluate(pair, homographies, sigma)[0])
+        homographies, columns, scores = found.settle(homographies, columns, level)
         homographies = homographies[_best_distinct(columns, scores, n_kept)]
-    return sorted(best.values(), key=lambda one: -one.score)
+    _without_one(found)
+    return found.ordered()
+
+
+def _without_one(found: _Found) -> None:
+    """The best matchings again, each without one of its least likely matches: one false match bends the
+    fit towards itself and so hides how ill it suits the others."""
+    starts, columns = [], []
+    for one in found.ordered()[:N_DOUBTED]:
+        rows = np.flatnonzero(one.columns >= 0)
+        if len(rows) < LEAST_DOUBTED:
+            continue
+        gains = one.gains[rows, one.columns[rows]]
+        for row in rows[np.argsort(gains, kind="stable")[: min(DOUBTS, (gains < DOUBTED_GAIN).sum())]]:
+            starts.append(one.homography)
+            columns.append(np.where(np.arange(len(one.columns)) == row, -1, one.columns))
+    if not starts:
+        return
+    for level in DOUBT_LEVELS:
+        homographies, again, _ = found.settle(np.array(starts), np.array(columns), level)
+        found.settle(homographies, again, level)
