@@ -37,3 +37,20 @@ def bench_detection(
         from tools.train_detector import evaluate
     with plain_errors():
         evaluate(scenes=scenes, seed=seed)
+
+
+@bench.command("registration")
+def bench_registration(
+    pairs: Annotated[int, typer.Option(min=1, help="Pairs of views a cell.")] = 1000,
+    rings: Annotated[int, typer.Option(min=1, help="Rings of views a cell.")] = 200,
+    seed: Annotated[int, typer.Option(min=0)] = 1,
+    only: Annotated[str, typer.Option(help="Only rows with this in their name, or a part.")] = "",
+    out: Annotated[Path, typer.Option(help="Folder for the tables and figures.")] = Path("runs/bench"),
+) -> None:
+    """Synthetic pairs, rings and episodes, peers, speed, and the paper's experiment on real pixels."""
+    with wanted_extra("bench"):
+        import pycpd  # noqa: F401
+
+        from tools.bench.registration import command
+    with plain_errors():
+        command(pairs, rings, seed, only, out)

@@ -1,339 +1,177 @@
-"""Success of registration on pods seen through a pinhole camera, cell by cell; seeded, so that anyone gets
-these figures.
+"""`podwatch bench registration`: how often registration is right, cell by cell, beside what is promised.
 
-Animals are 20-point outlines of whales of 7 to 13 m, 2.5 lengths apart; each view has its own heading,
-height and tilt, and each edge of a box is off by a share of its side. A pair is right only where the whole
-set of matches is.
+Every trial has a generator of its own, made from the seed, the cell's name and the trial's number: so a cell
+gives the same figure alone and among all, on one processor and on many.
 """
 
-import argparse
+import os
+import sys
 import time
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from dataclasses import dataclass, field
+from multiprocessing import get_context
+from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from drivers.cameras.pinhole import Pinhole, Pose, apply_homography
-from procs.registrar.box_icp import BoxAlignment, box_icp
-from procs.registrar.ring import RingRegistration, register_ring
+from tools.bench import registration_figure as figure
+from tools.bench.registration_cells import EPISODES, PAIRS, PROMISES, RINGS, row_of
+from tools.bench.registration_pairs import pair_counts, pair_success
+from tools.bench.registration_peers import METHODS, peer_counts, peer_key, peer_table
+from tools.bench.registration_pixels import pixel_rows
+from tools.bench.registration_rings import episode_counts, is_ring_right, ring_counts, ring_success
+from tools.bench.registration_scenes import CAMERA, IMAGE_SIZE, Cell, View, draw_views
+from tools.bench.registration_speed import speed_rows
+from tools.bench.table import Row, measured, print_table, write_table
 
-__all__ = ["Cell", "View", "draw_pod", "draw_views", "is_ring_right", "main", "pair_success", "ring_success"]
+__all__ = [
+    "CAMERA",
+    "IMAGE_SIZE",
+    "PAIRS",
+    "RINGS",
+    "Cell",
+    "View",
+    "command",
+    "draw_views",
+    "is_ring_right",
+    "pair_success",
+    "ring_success",
+]
 
-Array = NDArray[np.float64]
-Ints = NDArray[np.intp]
+MOST_PEER_PAIRS = 100
+RINGS_A_SEQUENCE = 4  # a sequence of episodes costs about as much as this many rings
+TIMED = ("full view N=5", "full view N=9", "full view N=20")
+SPEED, PEERS, FIGURE, PIXELS = "speed", "peers", "figure", "real pixels"
+PRINTED_WIDTH = 150  # in a file or a pipe
+ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
-IMAGE_SIZE = (1280, 960)
-CAMERA = Pinhole(IMAGE_SIZE, float(np.deg2rad(70.0)))
-SPACING = 2.5  # lengths between neighbouring animals, at least 0.6 of it after the jitter of the layout
-MEAN_LENGTH_M = 10.0
+Counting = Callable[..., Counter[str]]
 
 
 @dataclass(frozen=True)
-class View:
-    """What one camera's detector said: boxes (N, 4) px, and which animal each is (N,), -1 a false alarm;
-    its pose.
-    """
+class Task:
+    """A few trials of one cell; `key` is whose counts they add to."""
 
-    boxes: Array
-    animals: Ints
-    pose: Pose
-
-
-@dataclass(frozen=True)
-class Cell:
-    """One row of the table: the pod, the cameras and the detector's errors."""
-
-    name: str
-    n_animals: int
-    n_views: int = 2
-    heading_rad: float = np.pi
-    height_ratio: tuple[float, float] = (0.7, 1.4)
-    tilt_rad: float = float(np.deg2rad(10.0))
-    jitter: float = 0.05
-    missed: float = 0.0
-    false: float = 0.0
-    moved: float = 0.0
-    shift: float = 0.0
-    heading_prior: bool = False
-    literal: bool = False
+    key: str
+    count: Counting
+    arguments: tuple[object, ...]
+    trials: range
 
 
-def draw_outlines(n: int, rng: np.random.Generator) -> Array:
-    """(n, 20, 2) outlines in metres round each animal's centre, random length and heading."""
-    lengths = rng.uniform(7.0, 13.0, n)
-    widths = lengths * rng.uniform(0.18, 0.26, n)
-    along = np.linspace(0.0, np.pi, 10)
-    profile = np.sin(along) ** 0.8 * (1 + 0.35 * np.cos(along))  # the head is blunter than the tail
-    half = np.column_stack([np.cos(along) / 2, profile / profile.max() / 2])
-    outline = np.concatenate([half, half[::-1] * [1, -1]])
-    headings = rng.uniform(0, 2 * np.pi, n)
-    scaled = outline[None] * np.stack([lengths, widths], axis=1)[:, None, :]
-    turn = np.stack([[np.cos(headings), -np.sin(headings)], [np.sin(headings), np.cos(headings)]]).transpose(
-        2, 0, 1
-    )
-    return np.asarray(np.einsum("nab,npb->npa", turn, scaled))
+@dataclass
+class Found:
+    """What all tasks of one key came to."""
+
+    counts: Counter[str] = field(default_factory=Counter)
+    failures: list[str] = field(default_factory=list)
 
 
-def draw_centres(n: int, rng: np.random.Generator) -> Array:
-    """(n, 2) centres in metres: a loose crowd in which no two are nearer than the spacing."""
-    spacing = SPACING * MEAN_LENGTH_M
-    radius = spacing * 0.75 * np.sqrt(n)
-    centres = np.zeros((0, 2))
-    while len(centres) < n:
-        point = rng.uniform(-radius, radius, 2)
-        if not len(centres) or np.linalg.norm(centres - point, axis=1).min() > spacing:
-            centres = np.vstack([centres, point])
-        else:
-            radius *= 1.01
-    return np.asarray(centres - centres.mean(axis=0))
+def run_task(task: Task) -> Counter[str]:
+    """In a process of its own."""
+    return task.count(*task.arguments, task.trials)
 
 
-def draw_pod(n: int, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Centres (n, 2) and outlines (n, 20, 2) in metres."""
-    return draw_centres(n, rng), draw_outlines(n, rng)
+def command(pairs: int, rings: int, seed: int, only: str, out: Path) -> None:
+    """Measure, print the tables, write them as JSON and the figures as PNG into `out`."""
+    console = Console(width=None if sys.stdout.isatty() else PRINTED_WIDTH)
+    began = time.monotonic()
+    out.mkdir(parents=True, exist_ok=True)
+    promises = [promise for promise in PROMISES if only.lower() in promise.name.lower()]
+    parts = [part for part in (SPEED, PEERS, FIGURE, PIXELS) if only.lower() in part]
+    wanted = dict.fromkeys(cell for promise in promises for cell in promise.cells)
+    tasks = [*_promised_tasks(wanted, pairs, rings, seed)]
+    peer_pairs = min(pairs, MOST_PEER_PAIRS)
+    if PEERS in parts:
+        tasks += _peer_tasks([(cell.name, cell) for cell in PAIRS], METHODS, peer_pairs, seed)
+    if FIGURE in parts:
+        points = [(point.key, point.cell) for point in figure.POINTS]
+        tasks += _peer_tasks(points, METHODS, peer_pairs, seed)
+    for name in ONE_THREAD:
+        os.environ[name] = "1"  # before the processes start: each is one of as many as there are processors
+    found = _count_all(tasks, console)
+    rows = [row_of(promise, seed, *_together(found, promise.cells)) for promise in promises]
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as alone:
+        if SPEED in parts:
+            rows += alone.submit(_all_speed_rows, seed).result()
+        if PIXELS in parts:
+            with console.status(PIXELS):
+                rows += alone.submit(_all_pixel_rows, seed, out).result()
+    print_table("podwatch bench registration", rows, console)
+    write_table(out / "bench_registration.json", rows)
+    counts = {key: one.counts for key, one in found.items()}
+    if PEERS in parts:
+        console.print(peer_table(counts, PAIRS, TIMED))
+    if FIGURE in parts:
+        figure.draw(counts, peer_pairs, seed).savefig(out / "registration_axes.png")
+    console.print(f"{time.monotonic() - began:.0f} s; tables and figures in {out}", highlight=False)
 
 
-def _pose(reach_m: float, cell: Cell, heading_rad: float, ratio: float, rng: np.random.Generator) -> Pose:
-    """A camera over the pod's middle, high enough that the highest ratio sees all of it."""
-    half_view = CAMERA.vfov_rad / 2 - cell.tilt_rad
-    height = reach_m / np.tan(half_view) * 1.02 * ratio / cell.height_ratio[0]
-    direction, size = rng.uniform(0, 2 * np.pi), cell.tilt_rad * np.sqrt(rng.uniform())
-    offset = rng.normal(0.0, 0.02 * height, 2)
-    return Pose(
-        offset[0], offset[1], -height, size * np.cos(direction), size * np.sin(direction), heading_rad
-    )
+def _all_speed_rows(seed: int) -> list[Row]:
+    return measured(speed_rows(seed), SPEED)
 
 
-def look(centres: Array, outlines: Array, pose: Pose, cell: Cell, rng: np.random.Generator) -> View:
-    """The boxes of the animals whose centre is in the image, with the detector's errors, in random order."""
-    homography = CAMERA.ground_to_image(pose)
-    points = apply_homography(homography, (centres[:, None] + outlines).reshape(-1, 2)).reshape(
-        *outlines.shape
-    )
-    boxes = np.concatenate([points.min(axis=1), points.max(axis=1)], axis=1)
-    middle = (boxes[:, :2] + boxes[:, 2:]) / 2
-    seen = ((middle > 0) & (middle < IMAGE_SIZE)).all(axis=1) & (rng.uniform(size=len(boxes)) >= cell.missed)
-    animals = np.flatnonzero(seen)
-    boxes = boxes[animals]
-    n_false = rng.binomial(len(centres), cell.false)
-    if n_false and len(boxes):
-        sides = (boxes[:, 2:] - boxes[:, :2])[rng.integers(len(boxes), size=n_false)]
-        places = rng.uniform(0, 1, (n_false, 2)) * IMAGE_SIZE
-        boxes = np.concatenate([boxes, np.concatenate([places - sides / 2, places + sides / 2], axis=1)])
-        animals = np.concatenate([animals, np.full(n_false, -1)])
-    sides = np.tile(boxes[:, 2:] - boxes[:, :2], 2)
-    boxes = boxes + rng.normal(0.0, cell.jitter, boxes.shape) * sides
-    boxes = np.concatenate(
-        [np.minimum(boxes[:, :2], boxes[:, 2:]), np.maximum(boxes[:, :2], boxes[:, 2:])], axis=1
-    )
-    order = rng.permutation(len(boxes))
-    return View(boxes[order], animals[order], pose)
+def _all_pixel_rows(seed: int, out: Path) -> list[Row]:
+    return measured(pixel_rows(seed, out), PIXELS)
 
 
-def draw_views(cell: Cell, rng: np.random.Generator) -> list[View]:
-    """One pod seen by `cell.n_views` cameras; animals move anew before each further view."""
-    centres, outlines = draw_pod(cell.n_animals, rng)
-    reach = float(np.linalg.norm(centres, axis=1).max()) + MEAN_LENGTH_M * (0.7 + 1.5 * cell.moved)
-    views = []
-    for index in range(cell.n_views):
-        ratio = 1.0 if index == 0 else float(np.exp(rng.uniform(*np.log(cell.height_ratio))))
-        heading = float(rng.uniform(-cell.heading_rad, cell.heading_rad)) if index else 0.0
-        pose = _pose(reach, cell, heading, ratio, rng)
-        if index and cell.shift:
-            width = 2 * pose.height_m * np.tan(CAMERA.vfov_rad / 2) * IMAGE_SIZE[0] / IMAGE_SIZE[1]
-            toward = rng.uniform(0, 2 * np.pi)
-            pose = Pose(
-                pose.n_m + cell.shift * width * np.cos(toward),
-                pose.e_m + cell.shift * width * np.sin(toward),
-                *(pose.d_m, pose.roll_rad, pose.pitch_rad, pose.yaw_rad),
-            )
-        ways = rng.uniform(0, 2 * np.pi, cell.n_animals)
-        step = np.column_stack([np.cos(ways), np.sin(ways)]) * MEAN_LENGTH_M * cell.moved * (index > 0)
-        views.append(look(centres + step, outlines, pose, cell, rng))
-    return views
+def _in_chunks(key: str, count: Counting, arguments: tuple[object, ...], n: int, size: int) -> Iterator[Task]:
+    for start in range(0, n, size):
+        yield Task(key, count, arguments, range(start, min(start + size, n)))
 
 
-def true_matches(source: View, target: View) -> list[tuple[int, int]]:
-    """Rows of (source, target) that are the same animal."""
-    where = {int(animal): row for row, animal in enumerate(target.animals) if animal >= 0}
-    return [(row, where[int(animal)]) for row, animal in enumerate(source.animals) if int(animal) in where]
+def _promised_tasks(wanted: Iterable[str], pairs: int, rings: int, seed: int) -> Iterator[Task]:
+    """The longest first, so that no processor waits for one at the end."""
+    chosen = set(wanted)
+    if EPISODES.name in chosen:
+        sequences = -(-rings // RINGS_A_SEQUENCE)
+        yield from _in_chunks(EPISODES.name, episode_counts, (EPISODES, seed), sequences, 5)
+    for cell in RINGS:
+        if cell.name in chosen:
+            yield from _in_chunks(cell.name, ring_counts, (cell, seed), rings, 10)
+    for cell in PAIRS:
+        if cell.name in chosen:
+            yield from _in_chunks(cell.name, pair_counts, (cell, seed), pairs, 50)
 
 
-def pair_success(
-    cell: Cell, trials: int, seed: int, register: Callable[..., BoxAlignment] = box_icp
-) -> dict[str, float]:
-    """Shares over `trials` pairs: strictly right, precision, recall, wrong at confidence >= 0.9; and ms a
-    call.
-    """
-    rng = np.random.default_rng(seed)
-    right = sure_wrong = sure = 0
-    true_found = found = true_total = 0
-    elapsed = 0.0
-    for _ in range(trials):
-        source, target = draw_views(cell, rng)
-        prior = None
-        if cell.heading_prior:
-            prior = (
-                target.pose.yaw_rad - source.pose.yaw_rad + rng.normal(0.0, np.deg2rad(8.0)),
-                np.deg2rad(8.0),
-            )
-        begin = time.process_time()
-        answer = register(
-            source.boxes,
-            target.boxes,
-            image_size=IMAGE_SIZE,
-            heading_prior_rad=prior,
-            mode="literal" if cell.literal else "robust",
-        )
-        elapsed += time.process_time() - begin
-        wanted = set(true_matches(source, target))
-        got = {(int(a), int(b)) for a, b in answer.matches}
-        right += got == wanted
-        sure += answer.confidence >= 0.9
-        sure_wrong += answer.confidence >= 0.9 and got != wanted
-        true_found, found, true_total = (
-            true_found + len(got & wanted),
-            found + len(got),
-            true_total + len(wanted),
-        )
-    return {
-        "right": right / trials,
-        "precision": true_found / max(found, 1),
-        "recall": true_found / max(true_total, 1),
-        "sure": sure / trials,
-        "sure_wrong": sure_wrong / trials,
-        "ms": elapsed / trials * 1e3,
-    }
+def _peer_tasks(
+    cells: Iterable[tuple[str, Cell]], methods: Iterable[str], pairs: int, seed: int
+) -> Iterator[Task]:
+    for name, cell in cells:
+        for method in methods:
+            key = peer_key(method, name)
+            yield from _in_chunks(key, peer_counts, (method, cell, seed), pairs, 50)
 
 
-def _is_in_another_view(row: int, view: View, others: list[View]) -> bool:
-    """Whether the ground under a box lies a body inside another camera's image."""
-    box = view.boxes[row]
-    ground = apply_homography(CAMERA.image_to_ground(view.pose), ((box[:2] + box[2:]) / 2)[None])
-    for other in others:
-        place = apply_homography(CAMERA.ground_to_image(other.pose), ground)[0]
-        depth = min(*place, *(IMAGE_SIZE - place))
-        if depth > float(np.linalg.norm(box[2:] - box[:2])) * view.pose.height_m / other.pose.height_m:
-            return True
-    return False
+def _count_all(tasks: list[Task], console: Console) -> dict[str, Found]:
+    """All tasks in as many processes as there are processors, with a line of progress."""
+    found: dict[str, Found] = {}
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with (
+        Progress(*columns, console=console, transient=True) as progress,
+        ProcessPoolExecutor(os.cpu_count(), mp_context=get_context("spawn")) as pool,
+    ):
+        line = progress.add_task("registration", total=len(tasks))
+        running: dict[Future[Counter[str]], Task] = {pool.submit(run_task, task): task for task in tasks}
+        for future in as_completed(running):
+            task = running[future]
+            one = found.setdefault(task.key, Found())
+            error = future.exception()
+            if error is None:
+                one.counts.update(future.result())
+            else:
+                one.failures.append(f"{type(error).__name__}: {error}")
+            progress.update(line, advance=1, description=task.key[:40])
+    return found
 
 
-def is_ring_right(views: list[View], registration: RingRegistration) -> bool:
-    """Every animal that two views hold has one id in all of them, no two share one, and no false alarm has
-    an id but one of its own, where no other view could deny it.
-    """
-    holders: dict[int, int] = {}
-    for view in views:
-        for animal in view.animals.tolist():
-            holders[animal] = holders.get(animal, 0) + 1
-    id_of: dict[int, int] = {}
-    false_ids: list[int] = []
-    for index, (view, identities) in enumerate(zip(views, registration.identities, strict=True)):
-        others = views[:index] + views[index + 1 :]
-        for row, (animal, identity) in enumerate(
-            zip(view.animals.tolist(), identities.tolist(), strict=True)
-        ):
-            if animal < 0 and identity >= 0:
-                if _is_in_another_view(row, view, others):
-                    return False
-                false_ids.append(identity)
-            elif animal >= 0 and holders[animal] >= 2:
-                is_same_id = identity >= 0 and id_of.setdefault(animal, identity) == identity
-                if not is_same_id:
-                    return False
-    owners = [*id_of.values(), *false_ids]
-    return len(dict.fromkeys(owners)) == len(owners)
-
-
-def ring_success(cell: Cell, trials: int, seed: int) -> dict[str, float]:
-    """Shares over `trials` rings: every box right, consensus among the right ones, consensus on wrong
-    ones; ms a ring."""
-    rng = np.random.default_rng(seed)
-    right = proved = wrong_proved = repaired = 0
-    elapsed = 0.0
-    for _ in range(trials):
-        views = draw_views(cell, rng)
-        begin = time.process_time()
-        answer = register_ring([view.boxes for view in views], image_size=IMAGE_SIZE)
-        elapsed += time.process_time() - begin
-        is_right = is_ring_right(views, answer)
-        right += is_right
-        proved += is_right and answer.consensus
-        wrong_proved += answer.consensus and not is_right
-        repaired += answer.repaired
-    return {
-        "right": right / trials,
-        "proved": proved / max(right, 1),
-        "wrong_proved": wrong_proved / trials,
-        "repaired": repaired / trials,
-        "ms": elapsed / trials * 1e3,
-    }
-
-
-PAIRS = (
-    Cell(
-        "literal, heading 15, jitter 2 %, N=9",
-        9,
-        heading_rad=float(np.deg2rad(15)),
-        jitter=0.02,
-        literal=True,
-    ),
-    Cell("full view N=5", 5),
-    Cell("full view N=9", 9),
-    Cell("full view N=20", 20),
-    Cell("full view N=3", 3),
-    Cell("full view N=2", 2),
-    Cell("full view N=2, heading prior", 2, heading_prior=True),
-    Cell("tilt 20, jitter 10 %, N=5", 5, tilt_rad=float(np.deg2rad(20)), jitter=0.1),
-    Cell("tilt 20, jitter 10 %, N=9", 9, tilt_rad=float(np.deg2rad(20)), jitter=0.1),
-    Cell("moved 0.5, N=9", 9, moved=0.5),
-    Cell("moved 1, N=9", 9, moved=1.0),
-    Cell("moved 2, N=9", 9, moved=2.0),
-    Cell("10 % missed, 5 % false, N=9", 9, missed=0.1, false=0.05),
-    Cell("20 % missed, 10 % false, N=5", 5, missed=0.2, false=0.1),
-    Cell("20 % missed, 10 % false, N=9", 9, missed=0.2, false=0.1),
-    Cell("20 % missed, 10 % false, N=20", 20, missed=0.2, false=0.1),
-    Cell("shifted 10 %, N=12", 12, shift=0.1),
-    Cell("shifted 25 %, N=12", 12, shift=0.25),
-    Cell("shifted 50 %, N=12", 12, shift=0.5),
-    Cell(
-        "missed, false, moved 0.25, tilt 15, N=9",
-        9,
-        missed=0.1,
-        false=0.05,
-        moved=0.25,
-        tilt_rad=float(np.deg2rad(15)),
-    ),
-)
-RINGS = (
-    Cell("ring N=5 n=3", 5, n_views=3),
-    Cell("ring N=9 n=3", 9, n_views=3),
-    Cell("ring N=9 n=6", 9, n_views=6),
-    Cell("ring N=9 n=12", 9, n_views=12),
-    Cell("ring N=9 n=20, 5 % missed 2 % false", 9, n_views=20, missed=0.05, false=0.02),
-    Cell("ring N=9 n=12, 10 % missed 5 % false", 9, n_views=12, missed=0.1, false=0.05),
-    Cell("ring N=3 n=6, jitter 10 %", 3, n_views=6, jitter=0.1),
-)
-
-
-def main() -> None:
-    """Print one line a cell."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--pairs", type=int, default=1000, help="pairs a cell")
-    parser.add_argument("--rings", type=int, default=200, help="rings a cell")
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--only", default="", help="only the cells whose name contains this")
-    chosen = parser.parse_args()
-    for cells, trials, measure in ((PAIRS, chosen.pairs, pair_success), (RINGS, chosen.rings, ring_success)):
-        for cell in cells:
-            if trials and chosen.only in cell.name:
-                figures = measure(cell, trials, chosen.seed)
-                shown = "  ".join(
-                    f"{name} {value * (1 if name == 'ms' else 100):6.2f}" for name, value in figures.items()
-                )
-                print(f"{cell.name:42s} n={trials:<5d} {shown}", flush=True)
-
-
-if __name__ == "__main__":
-    main()
+def _together(found: dict[str, Found], cells: Iterable[str]) -> tuple[Counter[str], list[str]]:
+    counts: Counter[str] = Counter()
+    failures: list[str] = []
+    for cell in cells:
+        one = found.get(cell, Found(failures=[f"{cell} was not measured"]))
+        counts.update(one.counts)
+        failures += one.failures
+    return counts, failures
