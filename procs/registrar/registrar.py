@@ -226,11 +226,11 @@ class Registrar:
         if instant > 0 and first is not None and first.finished:
             memory = first.result.memory  # the second look confirms the ids of the first
         look.node = RingNode(
+            boxes,
             self._drone_id,
             running.proposal.members,
             running.proposal.number,
             running.proposal.proposer,
-            boxes,
             image_size=self._camera.image_size,
             view=view,
             memory=memory,

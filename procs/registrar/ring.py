@@ -78,11 +78,11 @@ class RingNode:
 
     def __init__(
         self,
+        boxes: ArrayLike,
         drone_id: int,
         members: Sequence[int],
-        episode: int,
-        proposer: int,
-        boxes: ArrayLike,
+        episode: int = 1,
+        proposer: int = 1,
         *,
         image_size: tuple[int, int] | None = None,
         view: ViewGeometry | None = None,
@@ -90,7 +90,7 @@ class RingNode:
         register: Register = align_marks,
         is_blind: bool = False,
     ) -> None:
-        """`members` are drone ids in ring order, `boxes` (N, 4) px of the frame at the episode's instant.
+        """`boxes` (N, 4) px of the frame at the episode's instant; `members` are drone ids in ring order.
 
         is_blind: there was no frame at that instant. Such a drone hands the map on, and its edge has no
         confidence, so that nobody takes its silence for a confirmation.
@@ -133,9 +133,9 @@ class RingNode:
         if drone_id in self.members and drone_id != self.drone_id and drone_id not in self._lost:
             self._lost.append(drone_id)
 
-    def step(self, inbox: Sequence[bytes], now_s: float) -> list[bytes]:
+    def step(self, inbox: Sequence[bytes], now_s: float = 0.0) -> list[bytes]:
         """Take in the neighbours' packets, act if it is this drone's turn, and return what to say to both
-        neighbours now.
+        neighbours now. `now_s` only ages the memory.
         """
         for packet in inbox:
             self._hear(packet)
@@ -354,7 +354,7 @@ def register_ring(
     members = list(range(1, len(views) + 1))
     nodes = [
         RingNode(
-            *(number, members, 1, 1, boxes),
+            *(boxes, number, members),
             image_size=image_size,
             view=geometry[number - 1] if geometry else None,
             memory=memory,

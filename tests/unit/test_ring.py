@@ -35,7 +35,7 @@ def geometry_of(view, rng):
 def nodes_of(views, members=None, **changes):
     members = members or list(range(1, len(views) + 1))
     return [
-        RingNode(number, members, EPISODE, PROPOSER, view.boxes, image_size=IMAGE_SIZE, **changes)
+        RingNode(view.boxes, number, members, EPISODE, PROPOSER, image_size=IMAGE_SIZE, **changes)
         for number, view in zip(members, views, strict=True)
     ]
 
@@ -135,8 +135,8 @@ def test_an_animal_outside_every_other_view_has_an_id_of_its_own():
     far = np.array([[1200.0, 900.0, 1278.0, 958.0]])
     pose_scaled = [views[0].boxes / 2, np.concatenate([views[0].boxes / 2, far])]
     # The first camera's picture ends where the second's goes on.
-    first = RingNode(1, [1, 2], 1, 1, pose_scaled[0], image_size=(640, 480))
-    second = RingNode(2, [1, 2], 1, 1, pose_scaled[1], image_size=IMAGE_SIZE)
+    first = RingNode(pose_scaled[0], 1, [1, 2], image_size=(640, 480))
+    second = RingNode(pose_scaled[1], 2, [1, 2], image_size=IMAGE_SIZE)
     fly([first, second], [(0, 1)])
     assert second.result.identities[-1] >= 0
     assert second.result.identities[:-1].tolist() == first.result.identities.tolist()
@@ -168,8 +168,8 @@ def test_a_drone_that_had_no_frame_confirms_nothing(blind_row):
     views = views_of(5, 2, seed=9)
     nodes = [
         RingNode(
-            *(row + 1, [1, 2], EPISODE, PROPOSER),
             np.zeros((0, 4)) if row == blind_row else view.boxes,
+            *(row + 1, [1, 2], EPISODE, PROPOSER),
             image_size=IMAGE_SIZE,
             is_blind=row == blind_row,
         )
@@ -236,7 +236,7 @@ def test_rubbish_is_counted_and_dropped(data):
 
 def test_packets_of_another_episode_are_dropped():
     views = views_of(3, 2, seed=1)
-    other = RingNode(1, [1, 2], EPISODE + 1, PROPOSER, views[0].boxes, image_size=IMAGE_SIZE)
+    other = RingNode(views[0].boxes, 1, [1, 2], EPISODE + 1, PROPOSER, image_size=IMAGE_SIZE)
     node = nodes_of(views)[1]
     assert node.step(other.step([], 0.0), 0.0) == []
     assert node.packets_refused == 1
@@ -244,11 +244,11 @@ def test_packets_of_another_episode_are_dropped():
 
 def test_a_node_refuses_a_roster_that_it_is_not_in():
     with pytest.raises(ValueError, match="drone 3"):
-        RingNode(3, [1, 2], 1, 1, np.zeros((0, 4)))
+        RingNode(np.zeros((0, 4)), 3, [1, 2])
     with pytest.raises(ValueError, match="each member once"):
-        RingNode(1, [1, 1], 1, 1, np.zeros((0, 4)))
+        RingNode(np.zeros((0, 4)), 1, [1, 1])
     with pytest.raises(RuntimeError, match="still runs"):
-        _ = RingNode(1, [1, 2], 1, 1, np.zeros((0, 4))).result
+        _ = RingNode(np.zeros((0, 4)), 1, [1, 2]).result
     with pytest.raises(ValueError, match="views is empty"):
         register_ring([])
 
@@ -268,7 +268,7 @@ def test_the_map_tells_each_drone_where_it_is():
     views = views_of(6, 4, seed=13)
     geometry = [geometry_of(view, rng) for view in views]
     nodes = [
-        RingNode(k + 1, [1, 2, 3, 4], 1, 1, views[k].boxes, image_size=IMAGE_SIZE, view=geometry[k])
+        RingNode(views[k].boxes, k + 1, [1, 2, 3, 4], image_size=IMAGE_SIZE, view=geometry[k])
         for k in range(4)
     ]
     fly(nodes, ring_links(4))
@@ -335,7 +335,7 @@ def test_a_member_that_was_passed_over_while_it_lived_says_its_word_anew():
     sides = np.array([[30, 60], [50, 35], [40, 40], [60, 30], [35, 55]], float)
     boxes = np.hstack([centres - sides / 2, centres + sides / 2])
     shown = (boxes[:3], boxes, boxes[:3])  # the second alone sees two more
-    nodes = [RingNode(k + 1, [1, 2, 3], 1, 1, seen, image_size=IMAGE_SIZE) for k, seen in enumerate(shown)]
+    nodes = [RingNode(seen, k + 1, [1, 2, 3], image_size=IMAGE_SIZE) for k, seen in enumerate(shown)]
     first = nodes[0].step([], 0.0)
     nodes[2].drop_member(2)  # the third takes the second for lost and goes on with the first's map
     said = [first, nodes[1].step(first, 0.0), nodes[2].step(first, 0.0)]
