@@ -272,7 +272,9 @@ class Registrar:
             consensus,
             result.confidence if result is not None else 0.0,
         )
-        if result is not None and last is not None:
+        # What was not agreed changes nothing: boxes keep the names, and the map the animals, of the last
+        # agreement, which the drones that watch go by.
+        if consensus and result is not None and last is not None:
             self._take_over(last, result, pose_at, fleet_utime)
 
     def _same_matching(self, first: Look, second: Look) -> bool:
@@ -291,7 +293,7 @@ class Registrar:
     def _take_over(
         self, look: Look, result: NodeResult, pose_at: Callable[[int], Pose | None], fleet_utime: int
     ) -> None:
-        """The episode's result becomes what this drone believes."""
+        """The agreed result becomes what this drone believes."""
         if look.sighting is not None:
             self.carrier.name(look.sighting, [int(one) for one in result.identities])
             pose = pose_at(look.sighting.utime)
@@ -301,8 +303,7 @@ class Registrar:
         else:
             # Without a view of this episode all names are of an older one, whose ids may have been others.
             self.carrier.name(Sighting(look.t_utime, np.zeros((0, 4)), np.zeros((0, 2)), ()), [])
-        if self.finished is not None and self.finished.consensus:  # what was not agreed is not remembered
-            self.memory = result.memory
+        self.memory = result.memory
         mine = set(result.identities.tolist())
         self.map.replace(
             [

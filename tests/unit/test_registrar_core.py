@@ -150,28 +150,51 @@ def test_names_follow_the_animals_that_swim_while_the_ring_agrees():
     assert len(set(names[0].values()) - {-1}) == len(POD)
 
 
+def identity(source: Array, target: Array, *, prior: object = None) -> BoxAlignment:
+    count = min(len(source), len(target))
+    rows = np.arange(count)
+    return BoxAlignment(
+        transform=np.eye(3),
+        matches=np.column_stack([rows, rows]),
+        unmatched_source=np.arange(count, len(source)),
+        unmatched_target=np.arange(count, len(target)),
+        residual_px=0.0,
+        confidence=1.0,
+        is_ambiguous=False,
+        iterations=1,
+    )
+
+
 def test_identity_in_place_of_registration_is_no_consensus():
     """The ablation: closure must come from matching, not from the code round it."""
-
-    def identity(source: Array, target: Array, *, prior: object = None) -> BoxAlignment:
-        count = min(len(source), len(target))
-        rows = np.arange(count)
-        return BoxAlignment(
-            transform=np.eye(3),
-            matches=np.column_stack([rows, rows]),
-            unmatched_source=np.arange(count, len(source)),
-            unmatched_target=np.arange(count, len(target)),
-            residual_px=0.0,
-            confidence=1.0,
-            is_ambiguous=False,
-            iterations=1,
-        )
-
     fleet = Fleet(3, register=identity)
     fleet.run(2.0)
     fleet.propose(1)
     fleet.run(9.0)
     assert not any(fleet.finished(k).consensus for k in fleet.ids)
+
+
+def test_an_episode_that_does_not_agree_takes_no_name_and_no_animal_away():
+    """Those that watch go by the names and the map of the last agreement: the failed one's may be others."""
+    fleet = flown(3)
+    names = {k: fleet.names(k) for k in fleet.ids}
+    places = {
+        k: {animal: entry.position_m.copy() for animal, entry in fleet.registrars[k].map.entries.items()}
+        for k in fleet.ids
+    }
+    pulls = {k: fleet.registrars[k].correction for k in fleet.ids}
+    for registrar in fleet.registrars.values():
+        registrar._register = identity
+    fleet.propose(2)
+    fleet.run(9.0)
+    for k in fleet.ids:
+        finished = fleet.finished(k)
+        assert (finished.number, finished.consensus) == (2, False)
+        assert fleet.names(k) == names[k]
+        assert fleet.registrars[k].map.entries.keys() == places[k].keys()
+        for animal, entry in fleet.registrars[k].map.entries.items():
+            assert np.linalg.norm(entry.position_m - places[k][animal]) < 1.0
+        assert abs(fleet.registrars[k].correction.yaw_rad - pulls[k].yaw_rad) < 1e-9
 
 
 def test_two_proposals_at_once_end_as_one_episode():
