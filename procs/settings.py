@@ -7,6 +7,8 @@ from __future__ import annotations
 import difflib
 import json
 import tomllib
+from itertools import combinations
+from math import hypot
 from pathlib import Path
 from typing import Any, ClassVar, Literal, Self, TypeVar
 
@@ -18,6 +20,7 @@ __all__ = [
     "DriverSpec",
     "DroneSettings",
     "LimitSettings",
+    "LogSettings",
     "Mission",
     "MissionError",
     "RadioSettings",
@@ -28,6 +31,9 @@ __all__ = [
 
 
 MAX_DRONES = 63  # members travel as a bitmap of 64 bits, signed
+LEAST_HOME_SPACING_M = 3.0  # nearer homes let two drones land on each other
+# A drone never flies nearer to its fence: what lies beyond is never reached (AUTOPILOT fact 11).
+FENCE_KEPT_M = 3.0
 
 
 class MissionError(Exception):
@@ -128,6 +134,14 @@ class RadioSettings(Section):
     key_file: str = "fleet.key"
 
 
+class LogSettings(Section):
+    """What each drone's logger keeps."""
+
+    segment_s: float = Field(600.0, ge=0, le=86400)  # length of one file of the log; 0: one file a start
+    quota_gb: float = Field(0.0, ge=0, le=100_000)  # above it the oldest pictures go first; 0: none
+    frames: bool = False  # whole frames too, to replay what looks at pixels: about 1 MB each
+
+
 class DroneEntry(Section):
     """One drone of the roster."""
 
@@ -148,6 +162,7 @@ class Mission(Section):
     assign: AssignSettings = AssignSettings()
     limits: LimitSettings = LimitSettings()
     radio: RadioSettings = RadioSettings()
+    log: LogSettings = LogSettings()
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -169,6 +184,32 @@ class Mission(Section):
                 low, high = self.limits.min_height_m, self.limits.max_height_m
                 raise ValueError(
                     f"{name} = {height_m} lies outside limits.min_height_m to max_height_m, {low} to {high}"
+                )
+        return self
+
+    @model_validator(mode="after")
+    def _homes_and_search_fit(self) -> Self:
+        for one, other in combinations(self.drones, 2):
+            apart_m = hypot(one.home_n_m - other.home_n_m, one.home_e_m - other.home_e_m)
+            if apart_m < LEAST_HOME_SPACING_M:
+                raise ValueError(
+                    f"drones: the homes of drones {one.id} and {other.id} are {apart_m:g} m apart; give each "
+                    f"its own home_n_m and home_e_m, at least {LEAST_HOME_SPACING_M:g} m from the others"
+                )
+        reach_m = self.limits.fence_radius_m - FENCE_KEPT_M
+        search = self.search
+        far_m = hypot(search.north_m, search.east_m) + search.radius_m
+        if far_m > reach_m:
+            raise ValueError(
+                f"search: its spiral goes {far_m:g} m from the origin, and limits.fence_radius_m = "
+                f"{self.limits.fence_radius_m:g} lets drones go {reach_m:g} m; lessen search.radius_m, or "
+                "widen the fence"
+            )
+        for drone in self.drones:
+            if hypot(drone.home_n_m, drone.home_e_m) > reach_m:
+                raise ValueError(
+                    f"drones: the home of drone {drone.id} lies outside limits.fence_radius_m = "
+                    f"{self.limits.fence_radius_m:g}; bring it nearer, or widen the fence"
                 )
         return self
 

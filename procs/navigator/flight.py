@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from procs.settings import LimitSettings
+from procs.settings import FENCE_KEPT_M, LimitSettings
 
 __all__ = ["approach", "inside_fence", "limited"]
 
@@ -36,8 +36,7 @@ def inside_fence(goal_ned: Array, limits: LimitSettings) -> Array:
     """
     goal = np.array(goal_ned, dtype=np.float64)
     reach_m = float(np.linalg.norm(goal[:2]))
-    # 3 m inside: an autopilot's own fence must not be touched (AUTOPILOT fact 11).
-    radius_m = max(limits.fence_radius_m - 3.0, 1.0)
+    radius_m = max(limits.fence_radius_m - FENCE_KEPT_M, 1.0)
     if reach_m > radius_m:
         goal[:2] *= radius_m / reach_m
     goal[2] = -float(np.clip(-goal[2], limits.min_height_m, limits.max_height_m))

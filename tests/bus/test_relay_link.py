@@ -65,7 +65,7 @@ class Side:
         self.reports, self.fleet, other.recorded = [], None, []
         settings = DroneSettings(
             drone_id=self.id,
-            mission=Mission(drones=(DroneEntry(id=1), DroneEntry(id=2))),
+            mission=Mission(drones=(DroneEntry(id=1), DroneEntry(id=2, home_e_m=10.0))),
             bus_url=f"{self.url}&recv_buf_size=4194304",
             run_dir=str(self.settings.parent),
             drivers={

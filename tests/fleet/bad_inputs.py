@@ -117,7 +117,7 @@ class Relays:
     def __init__(self, folder: Path) -> None:
         self.queue = EventQueue()
         self.ether = MemoryEther(np.random.default_rng(3), self._after)
-        self.mission = Mission(drones=(DroneEntry(id=1), DroneEntry(id=2)))
+        self.mission = Mission(drones=(DroneEntry(id=1), DroneEntry(id=2, home_e_m=10.0)))
         self._folder = folder
         self.recorded: list[bytes] = []
         self.beats: list[heartbeat_t] = []

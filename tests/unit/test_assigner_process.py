@@ -43,7 +43,7 @@ class Fleet:
             np.random.default_rng(3), self._after, latency_s=0.02, jitter_s=0.1, loss=loss
         )
         self.mission = Mission(
-            drones=tuple(DroneEntry(id=drone_id) for drone_id in places),
+            drones=tuple(DroneEntry(id=drone_id, home_e_m=10.0 * drone_id) for drone_id in places),
             assign=AssignSettings(minute_watched_m=minute_watched_m),
         )
         self.state = dict.fromkeys(places, State.ASSIGN)

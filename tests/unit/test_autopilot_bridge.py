@@ -403,7 +403,7 @@ def test_it_never_disarms(flying):
 
 def test_the_fence_holds_in_wind_and_noise():
     rig = Rig(gps_noise_m=1.5, compass_error_deg=5.0, wind=Wind((5.0, 3.0), 1.0))
-    rig.mission = Mission(limits={"fence_radius_m": 60.0})
+    rig.mission = Mission(limits={"fence_radius_m": 60.0}, search={"north_m": 0.0, "radius_m": 50.0})
     rig.bridge = Bridge(rig.mission, DRONE_ID)
     rig.take_off()
     rig.fly(25, kind=setpoint_t.VELOCITY, vn_m_s=10.0, ve_m_s=2.0)

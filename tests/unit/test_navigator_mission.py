@@ -295,8 +295,12 @@ def test_an_operator_start_waits_for_the_order() -> None:
 
 
 def test_every_setpoint_keeps_the_limits_and_expires() -> None:
-    settings = mission(2, limits={"fence_radius_m": 95.0, "speed_m_s": 5.0, "climb_m_s": 1.5})
-    fleet = Fleet(settings, POD + np.array([40.0, 0.0]), DRIFT)
+    settings = mission(
+        2,
+        limits={"fence_radius_m": 95.0, "speed_m_s": 5.0, "climb_m_s": 1.5},
+        search={"north_m": 70.0, "radius_m": 20.0},
+    )
+    fleet = Fleet(settings, POD + np.array([10.0, 0.0]), DRIFT)
     limits = settings.limits
     for _ in range(900):
         fleet.run(0.1)
@@ -307,6 +311,7 @@ def test_every_setpoint_keeps_the_limits_and_expires() -> None:
             assert -limits.climb_m_s - 1e-6 <= setpoint.vd_m_s <= limits.descent_m_s + 1e-6
             assert setpoint.expiry_utime == setpoint.utime + round(limits.setpoint_life_s * 1e6)
             assert np.linalg.norm(drone.ned[:2]) < limits.fence_radius_m
+    assert any(State.RENDEZVOUS in drone.states for drone in fleet.drones), "over a pod beyond the fence"
 
 
 def test_a_drone_outside_the_roster_is_refused() -> None:

@@ -35,7 +35,8 @@ class Fleet:
             np.random.default_rng(3),
             lambda delay_s, action: self.queue.schedule(self.queue.now_us + round(delay_s * S), action),
         )
-        mission = Mission(drones=tuple(DroneEntry(id=drone_id) for drone_id in range(1, n + 1)))
+        drones = (DroneEntry(id=drone_id, home_e_m=10.0 * drone_id) for drone_id in range(1, n + 1))
+        mission = Mission(drones=tuple(drones))
         self.heard: dict[int, list[tuple[str, bytes]]] = {}
         self.buses: dict[int, VirtualBus] = {}
         self.runtimes: dict[int, QueueRuntime] = {}

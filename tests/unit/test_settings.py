@@ -31,10 +31,10 @@ def test_a_file_that_says_nothing_is_the_default_fleet_of_three(tmp_path):
 
 
 def test_the_roster_is_in_ring_order_whatever_the_order_of_the_file(tmp_path):
-    text = "[[drones]]\nid = 9\nhome_n_m = 2.0\n[[drones]]\nid = 4\n"
+    text = "[[drones]]\nid = 9\nhome_n_m = 4.0\n[[drones]]\nid = 4\n"
     mission = load_mission(written(tmp_path, text), Mission)
     assert mission.roster == (4, 9)
-    assert mission.home(9).home_n_m == 2.0
+    assert mission.home(9).home_n_m == 4.0
     with pytest.raises(KeyError, match=r"drone 5 is not in the roster \(4, 9\)"):
         mission.home(5)
 
@@ -101,8 +101,9 @@ def test_a_fault_that_names_a_stranger_is_refused(tmp_path):
         ),
     ],
 )
-def test_homes_that_meet_and_places_beyond_the_fence_are_refused(text, says, tmp_path):
-    assert says in refused(tmp_path, text, SimMission)
+@pytest.mark.parametrize("kind", [Mission, SimMission])
+def test_homes_that_meet_and_places_beyond_the_fence_are_refused(kind, text, says, tmp_path):
+    assert says in refused(tmp_path, text, kind)
 
 
 @pytest.mark.parametrize(

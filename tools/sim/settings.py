@@ -2,8 +2,6 @@
 expected.
 """
 
-from itertools import combinations
-from math import hypot
 from typing import Literal, Self
 
 from pydantic import Field, model_validator
@@ -12,9 +10,6 @@ from drivers.sim.pod import PodSettings
 from procs.settings import Mission, Section
 
 __all__ = ["Expect", "Fault", "SimMission"]
-
-LEAST_HOME_SPACING_M = 3.0  # nearer homes let two drones land on each other
-FENCE_KEPT_M = 3.0  # a drone never flies nearer to its fence: what lies beyond is never reached
 
 
 class PodTable(Section):
@@ -98,32 +93,6 @@ class SimMission(Mission):
     expect: Expect = Expect()
     seed: int = Field(1, ge=0)
     duration_s: float = Field(420.0, ge=1, le=36000)  # simulated time after which a run is ended
-
-    @model_validator(mode="after")
-    def _homes_and_search_fit(self) -> Self:
-        for one, other in combinations(self.drones, 2):
-            apart_m = hypot(one.home_n_m - other.home_n_m, one.home_e_m - other.home_e_m)
-            if apart_m < LEAST_HOME_SPACING_M:
-                raise ValueError(
-                    f"drones: the homes of drones {one.id} and {other.id} are {apart_m:g} m apart; give each "
-                    f"its own home_n_m and home_e_m, at least {LEAST_HOME_SPACING_M:g} m from the others"
-                )
-        reach_m = self.limits.fence_radius_m - FENCE_KEPT_M
-        search = self.search
-        far_m = hypot(search.north_m, search.east_m) + search.radius_m
-        if far_m > reach_m:
-            raise ValueError(
-                f"search: its spiral goes {far_m:g} m from the origin, and limits.fence_radius_m = "
-                f"{self.limits.fence_radius_m:g} lets drones go {reach_m:g} m; lessen search.radius_m, or "
-                "widen the fence"
-            )
-        for drone in self.drones:
-            if hypot(drone.home_n_m, drone.home_e_m) > reach_m:
-                raise ValueError(
-                    f"drones: the home of drone {drone.id} lies outside limits.fence_radius_m = "
-                    f"{self.limits.fence_radius_m:g}; bring it nearer, or widen the fence"
-                )
-        return self
 
     @model_validator(mode="after")
     def _faults_fit(self) -> Self:
