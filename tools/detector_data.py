@@ -5,6 +5,7 @@ A sample is an RGB-ready BGR image and its boxes (N, 5): xyxy px and 1 where the
 animal is too faint or too far outside to be learnt either way.
 """
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -21,10 +22,12 @@ __all__ = [
     "Sample",
     "augment",
     "cached_scenes",
+    "held_out",
     "letterboxed",
     "numbered",
     "photograph_sample",
     "read_yolo",
+    "real_data",
     "scene_sample",
 ]
 
@@ -46,6 +49,22 @@ def numbered(path: Path) -> tuple[int, str]:
     """Sort key: the number in a file's name, so that w_2 comes before w_10."""
     digits = "".join(letter for letter in path.stem if letter.isdigit())
     return (int(digits) if digits else -1, path.name)
+
+
+def real_data() -> Path:
+    """The folder of real pictures: PODWATCH_REAL_DATA, or ../shared/data beside the project; it may be
+    missing.
+    """
+    beside = Path(__file__).resolve().parents[2] / "shared" / "data"
+    return Path(os.environ.get("PODWATCH_REAL_DATA", str(beside)))
+
+
+def held_out(images: Sequence[Path]) -> tuple[list[Path], list[Path]]:
+    """(for training, held out): every fifth in the order of the numbers in their names, from the first, is
+    held out.
+    """
+    ordered = sorted(images, key=numbered)
+    return [path for i, path in enumerate(ordered) if i % 5], ordered[::5]
 
 
 def cached_scenes(folder: Path, count: int, seed: int, split: str, outlines_csv: Path) -> list[Sample]:

@@ -9,7 +9,6 @@ Needs the `train` extra (torch, onnx). Every sample depends on (seed, step) alon
 an uninterrupted one would have seen.
 """
 
-import os
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -25,10 +24,11 @@ from tools.detector_data import (
     Sample,
     augment,
     cached_scenes,
+    held_out,
     letterboxed,
-    numbered,
     photograph_sample,
     read_yolo,
+    real_data,
     scene_sample,
 )
 from tools.detector_eval import Score, recall_by_length, score
@@ -63,22 +63,6 @@ class Settings:
     scenes: int = 3000  # rendered once: more of them cost disk and time, crops vary them
     scenes_seed: int = 0
     save_every_steps: int = 100  # a kill loses a minute
-
-
-def real_data() -> Path:
-    """The folder of real pictures: PODWATCH_REAL_DATA, or ../shared/data beside the project; it may be
-    missing.
-    """
-    beside = Path(__file__).resolve().parents[2] / "shared" / "data"
-    return Path(os.environ.get("PODWATCH_REAL_DATA", str(beside)))
-
-
-def held_out(images: Sequence[Path]) -> tuple[list[Path], list[Path]]:
-    """(for training, held out): every fifth in the order of the numbers in their names, from the first, is
-    held out.
-    """
-    ordered = sorted(images, key=numbered)
-    return [path for i, path in enumerate(ordered) if i % 5], ordered[::5]
 
 
 def _photographs(data: Path | None) -> list[Sample]:

@@ -143,13 +143,27 @@ def _frame(
         shrunk = small.shape[1] / cutout.image.shape[1]
         move = _about(shrunk * np.array([left + right, top + bottom]) / 2, scale / shrunk, turn, place)
         piece, cover = _levelled(np.asarray(small, dtype=np.uint8), water, place)
-        size = FRAME_SIZE
-        drawn = cv2.warpAffine(piece, move, size, flags=cv2.INTER_LINEAR)
-        share = cv2.warpAffine(cover, move, size, flags=cv2.INTER_LINEAR)[..., None]
-        canvas = canvas * (1 - share) + drawn * share
+        _lay(canvas, piece, cover, move)
         corners = shrunk * np.array([[left, top], [right, top], [right, bottom], [left, bottom]])
         quads.append(corners @ move[:, :2].T + move[:, 2])
     return np.asarray(np.clip(canvas, 0, 255), dtype=np.uint8), np.array(quads)
+
+
+def _lay(
+    canvas: NDArray[np.float32], piece: NDArray[np.float32], cover: NDArray[np.float32], move: Array
+) -> None:
+    """Draw the piece onto the canvas by a (2, 3) affine map, in the window that it covers."""
+    height, width = cover.shape
+    corners = np.array([[0, 0], [width, 0], [width, height], [0, height]]) @ move[:, :2].T + move[:, 2]
+    limit = np.array(FRAME_SIZE)
+    low = np.clip(np.floor(corners.min(axis=0)), 0, limit - 1).astype(int)
+    high = np.clip(np.ceil(corners.max(axis=0)), low + 1, limit).astype(int)
+    local = move - np.column_stack([np.zeros((2, 2)), low])
+    size = (int(high[0] - low[0]), int(high[1] - low[1]))
+    drawn = cv2.warpAffine(piece, local, size, flags=cv2.INTER_LINEAR)
+    share = cv2.warpAffine(cover, local, size, flags=cv2.INTER_LINEAR)[..., None]
+    window = canvas[low[1] : high[1], low[0] : high[0]]
+    window += share * (drawn - window)
 
 
 def _about(middle: Array, scale: float, turn: float, place: Array) -> Array:

@@ -19,8 +19,7 @@ from procs.detector.yolo import Detector
 from procs.registrar.box_icp import box_icp
 from tools.bench.registration_composite import VIEW_SIZE, CompositeView, composite_views
 from tools.bench.table import Row
-from tools.detector_data import read_yolo
-from tools.train_detector import held_out, real_data
+from tools.detector_data import held_out, read_yolo, real_data
 
 __all__ = ["draw", "pixel_rows"]
 
@@ -70,11 +69,11 @@ def pixel_rows(seed: int, out: Path) -> Iterator[Row]:
     pairs = [everything[row] for row in rng.choice(len(everything), N_PAIRS, replace=False).tolist()]
     yield _row("pairs right, any heading", views, pairs, "robust", seed)
     whole = [pair for pair in everything if complete[pair[0]] and complete[pair[1]]]
+    near = [pair for pair in whole if abs(_turn(views, pair)) < NEAR_RAD][:N_PAIRS]
     whole = [whole[row] for row in rng.choice(len(whole), min(N_PAIRS, len(whole)), replace=False).tolist()]
     yield _row("pairs of complete views right", views, whole, "robust", seed)
     yield _row("pairs right, literal mode", views, pairs, "literal", seed)
-    near = [pair for pair in everything if abs(_turn(views, pair)) < NEAR_RAD]
-    yield _row("pairs within 20 degrees right, literal mode", views, near[:N_PAIRS], "literal", seed)
+    yield _row("pairs of complete views within 20 degrees, literal mode", views, near, "literal", seed)
     draw(views).savefig(out / PICTURE)
 
 
