@@ -300,7 +300,7 @@ def test_every_setpoint_keeps_the_limits_and_expires() -> None:
         limits={"fence_radius_m": 95.0, "speed_m_s": 5.0, "climb_m_s": 1.5},
         search={"north_m": 70.0, "radius_m": 20.0},
     )
-    fleet = Fleet(settings, POD + np.array([10.0, 0.0]), DRIFT)
+    fleet = Fleet(settings, POD - np.array([15.0, 0.0]), DRIFT)
     limits = settings.limits
     for _ in range(900):
         fleet.run(0.1)
