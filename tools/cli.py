@@ -10,6 +10,7 @@ from tools import log
 from tools.bench.commands import bench
 from tools.errors import plain_errors, wanted_extra
 from tools.play import play
+from tools.replay import replay_command
 from tools.sim.command import sim
 
 # What a video reader cannot open, we tell in words of our own.
@@ -24,6 +25,7 @@ app = typer.Typer(
 train = typer.Typer(help="Train the models that ship (needs the `train` extra).", no_args_is_help=True)
 app.command("sim")(sim)
 app.command("play")(play)
+app.command("replay")(replay_command)
 app.add_typer(log.app, name="log")
 app.add_typer(train, name="train")
 app.add_typer(bench, name="bench")

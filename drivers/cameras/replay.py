@@ -55,6 +55,10 @@ class ReplayCamera:
         self._period_us = 1e6 / rate_hz
         self._loop = loop
         self._channel = self._best_channel()
+        self._pictures: Iterator[preview_t] = iter(())
+        self._next: preview_t | None = None
+        self._start_us = 0.0
+        self._n_calls = 0
         self._restart()
 
     def capture(self) -> Image | None:

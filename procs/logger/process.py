@@ -1,25 +1,63 @@
 """Logger: keeps the whole bus of its drone in an MCAP file.
 
 Hears every channel, raw; the channel table says which it keeps. Says LOG_STATE at 1 Hz. The file is flushed
-every second, so that a killed logger loses at most its last second; a respawned one goes on in a new file
-(name.1.mcap, name.2.mcap, ...) and overwrites nothing. Where the disk is full or a write fails it stops
-writing, says so in LOG_STATE and in its heartbeat, and the drone flies on without a log.
+every second, so that a killed logger loses at most its last second; a respawned one, and one whose segment's
+time is over, goes on in a new file (name.1.mcap, name.2.mcap, ...) and overwrites nothing. With a quota the
+oldest pictures are dropped first. Where the disk is full or a write fails it stops writing, says so in
+LOG_STATE and in its heartbeat, and the drone flies on without a log.
 """
 
 import shutil
 from pathlib import Path
 
 from lcmtypes import channels, make
-from lcmtypes.podwatch import log_state_t
+from lcmtypes.podwatch import frame_t, log_state_t, preview_t
 from logs.exceptions import LogError
-from logs.sequence import GapCounter
-from logs.writer import LogWriter, fresh_path
+from logs.sequence import GapCounter, read_head
+from procs.logger.files import LogFiles
 from procs.logger.selection import Selection, disk_is_full, disk_trouble
 from procs.runtime import Runtime, RuntimeFailure
 
 STATE_PERIOD_S = 1.0
 # LOG_STATE says at most this much: what is more than enough says the same on every machine and in every run.
 DISK_SHOWN_GB = 2.0
+
+
+class FrameKeeper:
+    """Turns a frame's handle into the whole image that the log keeps."""
+
+    def __init__(self, runtime: Runtime) -> None:
+        from drivers.cameras.replay import RAW_FORMAT  # a logger without it needs no pixels
+
+        self._format = RAW_FORMAT
+        self._runtime = runtime
+        self._frames = runtime.open("frames")
+        self._n_kept = self._n_gone = 0
+
+    def image(self, data: bytes) -> bytes | None:
+        """The encoded IMAGE of an encoded FRAME; None where its pixels are gone, which is told."""
+        if read_head(channels.FRAME, data) is None:
+            return None
+        frame = frame_t.decode(data)
+        pixels = self._frames.read(frame)
+        if pixels is None:
+            self._n_gone += 1
+            self._runtime.degraded(f"{self._n_gone} frames were gone before they were logged", cause="gone")
+            return None
+        self._n_kept += 1
+        return make(
+            preview_t,
+            utime=frame.utime,
+            seq=self._n_kept - 1,
+            drone_id=frame.drone_id,
+            frame_seq=frame.seq,
+            width=frame.width,
+            height=frame.height,
+            scale=1.0,
+            format=self._format,
+            n_bytes=pixels.nbytes,
+            data=pixels.tobytes(),
+        ).encode()
 
 
 class Logger:
@@ -32,17 +70,26 @@ class Logger:
         self._n_written = 0
         self._n_bytes = 0
         self._problem = ""
-        self._path = fresh_path(Path(runtime.settings.log_path))
-        self._writer = self._open()
+        self._path = Path(runtime.settings.log_path)
+        settings = runtime.settings.mission.log
+        self._keeper = FrameKeeper(runtime) if settings.frames else None
+        # What a quota drops first must lie in files of its own.
+        self._apart = (channels.PREVIEW,) if settings.quota_gb else ()
+        self._files = self._open()
 
     def hear(self, channel: str, data: bytes, utime: int) -> None:
         """One message of the bus."""
         self._gaps.see(channel, data)
-        if self._writer is None or not self._selection.keeps(channel):
+        if self._files is None or not self._selection.keeps(channel):
             return
         try:
-            self._writer.write(channel, data, utime)
+            if channel in self._apart:
+                self._files.write_picture(channel, data, utime)
+            else:
+                self._files.write(channel, data, utime)
             self._n_written += 1
+            if self._keeper is not None and channel == channels.FRAME:
+                self._keep_frame(self._keeper, data, utime)
         except LogError as error:
             self._runtime.degraded(str(error), cause="refused")
         except OSError as error:
@@ -51,27 +98,36 @@ class Logger:
     def tick(self) -> None:
         """Look at the disk, flush what is due and say LOG_STATE."""
         free_gb = self._free_gb()
-        if self._writer is not None:
+        if self._files is not None:
             self._check_disk(free_gb)
-        if self._writer is not None:
+        if self._files is not None:
             try:
-                self._writer.flush_due(self._runtime.utime)
-                self._n_bytes = self._writer.n_bytes
+                self._files.flush_due(self._runtime.utime)
+                self._n_bytes = self._files.n_bytes
+                self._path = self._files.path
+                self._files.keep_quota()
             except OSError as error:
                 self._fail(error)
         self._runtime.publish(channels.LOG_STATE, self._state(free_gb))
 
     def stop(self) -> None:
         """Close the file with its summary."""
-        if self._writer is None:
+        if self._files is None:
             return
         try:
-            self._writer.close()
+            self._files.close()
         except OSError as error:
             self._fail(error)
-        self._writer = None
+        self._files = None
 
-    def _open(self) -> LogWriter | None:
+    def _keep_frame(self, keeper: FrameKeeper, data: bytes, utime: int) -> None:
+        assert self._files is not None
+        image = keeper.image(data)
+        if image is not None:
+            self._files.write_picture(channels.IMAGE, image, utime)
+            self._n_written += 1
+
+    def _open(self) -> LogFiles | None:
         settings = self._runtime.settings
         metadata = {
             "process": self._runtime.process,
@@ -80,7 +136,9 @@ class Logger:
         }
         try:
             self._path.parent.mkdir(parents=True, exist_ok=True)
-            return LogWriter(self._path, drone_id=self._runtime.drone_id, metadata=metadata)
+            files = LogFiles(self._path, self._runtime.drone_id, metadata, settings.mission.log)
+            self._path = files.path
+            return files
         except (LogError, OSError) as error:
             self._problem = f"nothing is logged: {error}"
             self._runtime.degraded(self._problem, cause="log")
@@ -98,7 +156,7 @@ class Logger:
 
     def _fail(self, error: OSError) -> None:
         """A write failed: what was flushed stays readable, nothing more is written."""
-        self._writer = None
+        self._files = None
         self._problem = (
             f"{self._path}: writing failed ({error.strerror}); logging has stopped, restart the logger"
         )
@@ -118,7 +176,7 @@ class Logger:
             n_bytes=self._n_bytes,
             n_lost=self._gaps.n_lost,
             disk_free_gb=min(free_gb, DISK_SHOWN_GB),
-            ok=self._writer is not None,
+            ok=self._files is not None,
             problem=self._problem,
         )
 

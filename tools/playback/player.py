@@ -123,7 +123,8 @@ class Player:
             self._shown_s = now_s
             position = self.head.position_us(now_s)
             begin_us = self.begin_us or 0
-            self._show(self, 0.0 if position is None else (position - begin_us) / 1e6)
+            at_s = 0.0 if position is None else (position - begin_us) / 1e6
+            self._show(self, self._selection.start_s + at_s)
 
     def _said(self, entry: FleetMessage) -> Iterator[tuple[str, bytes]]:
         """(channel, bytes) of what one logged message says on the bus: itself, a frame, both or nothing."""

@@ -51,6 +51,10 @@ def sim(
         str, typer.Option(help="pixels, or boxes in place of pixels for large batches.")
     ] = "pixels",
     out: Annotated[Path, typer.Option(help="Where the run's folder is made.")] = Path("runs"),
+    log_frames: Annotated[
+        bool,
+        typer.Option("--log-frames", help="Log whole frames too, for `podwatch replay`: 4 MB/s a drone."),
+    ] = False,
     headless: Annotated[bool, typer.Option("--headless", help="No live display.")] = False,
     lockstep: Annotated[bool, typer.Option("--lockstep", help="One process on a virtual clock.")] = False,
 ) -> None:
@@ -58,7 +62,7 @@ def sim(
     console = Console()
     fallback = "" if lockstep or has_multicast_route() else NO_ROUTE
     with plain_errors():
-        chosen = with_overrides(read_mission(mission), drones, animals, seed, duration)
+        chosen = with_overrides(read_mission(mission), drones, animals, seed, duration, log_frames=log_frames)
         addresses = _addresses(autopilot, chosen, lockstep, fallback)
         plan = _plan(chosen, out, sensor, scene, addresses)
     if fallback:
@@ -123,6 +127,8 @@ def with_overrides(
     animals: int | None = None,
     seed: int | None = None,
     duration_s: float | None = None,
+    *,
+    log_frames: bool = False,
 ) -> SimMission:
     """The mission with the command line's values in place of the file's; validated again."""
     changed: dict[str, Any] = mission.model_dump()
@@ -135,6 +141,8 @@ def with_overrides(
         changed["seed"] = seed
     if duration_s is not None:
         changed["duration_s"] = duration_s
+    if log_frames:
+        changed["log"]["frames"] = True
     return validate(changed, SimMission, "command line")
 
 

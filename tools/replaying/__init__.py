@@ -1,0 +1,1 @@
+"""One process over a recorded log again: `podwatch replay`."""
