@@ -108,7 +108,7 @@ def test_the_same_seed_gives_the_same_answer() -> None:
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ({"method": "gnn"}, "method 'gnn' is not known; this release has: exact"),
+        ({"method": "auction"}, "method 'auction' is not known; this release has: gnn, gnn"),
         ({"costs": np.zeros(3)}, r"costs of shape \(3,\)"),
         ({"costs": np.array([[np.nan]])}, "cost nan"),
         ({"costs": np.array([[-1.0]])}, "cost -1.0"),

@@ -1,0 +1,174 @@
+"""Trains the assigner's network on points in a unit square, exports it for numpy, and measures it.
+
+    podwatch train assigner --out runs/assigner --seed 0   trains (goes on where it was stopped), exports
+    podwatch train assigner --smoke                         a few steps, an export and its check
+    podwatch train assigner --loss paper                    the paper's own network and loss
+
+Needs the `train` extra (torch). Every batch depends on (seed, step) alone, so a resumed run sees what an
+uninterrupted one would have seen.
+"""
+
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from procs.assigner.ring_rows import seen_by_round
+from tools.train_assigner_data import Batch, mixed_batch
+from tools.train_assigner_model import RingNetwork
+
+__all__ = ["Settings", "train"]
+
+APART = 40_000  # the benchmark draws from (seed, agents, goals): no fleet has this many
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What shapes a training, each with its reason."""
+
+    seed: int = 0
+    steps: int = 10_000  # 9 minutes on one idle core; more steps still help
+    rate: float = 3e-3  # the highest that never diverged with AdamW on this network
+    last_rate_share: float = 0.01  # a cosine down to this settles near ties
+    warmup_steps: int = 100
+    weight_decay: float = 1e-4
+    average_decay: float = 0.998  # the exported weights are a running mean over about 500 steps
+    clash_weight: float = 0.3  # of expected clashing pairs: without it agents are confident alone
+    round_weights: tuple[float, ...] = (0.0, 0.05, 0.05, 0.2, 0.05)  # cross-entropy after fewer rounds
+    save_every_steps: int = 100  # a kill loses seconds
+
+
+def batch_tensors(batch: Batch, random: np.random.Generator) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """(seen, allowed, delivered, labels) as the network and the loss take them; label -100: none to learn."""
+    count, n, _ = batch.costs.shape
+    delivered = random.random((batch.rounds, 2, count, n)) >= batch.loss
+    seen = list(seen_by_round(batch.costs, delivered))
+    allowed = torch.from_numpy(seen[0].allowed)
+    labels = torch.from_numpy(batch.labels).clone()
+    labels[
+        labels >= allowed.shape[2]
+    ] = -100  # all its goals are forbidden or taken, and going without is no choice
+    features = torch.from_numpy(np.stack([one.features for one in seen]).astype(np.float32))
+    return features, allowed, torch.from_numpy(delivered.astype(np.float32)), labels
+
+
+def assignment_loss(outs: list[Tensor], labels: Tensor, n_goals: int, settings: Settings) -> Tensor:
+    """Cross-entropy after the last round and, weighed less, earlier ones, and expected clashing pairs."""
+    n = labels.shape[1]
+    loss = functional.cross_entropy(outs[-1].flatten(0, 1), labels.flatten())
+    for logits, weight in zip(outs[:-1], settings.round_weights, strict=False):
+        if weight > 0:
+            loss = loss + weight * functional.cross_entropy(logits.flatten(0, 1), labels.flatten())
+    chances = outs[-1].softmax(dim=-1)[..., :n_goals]  # (B, n, g)
+    pairs = (chances.sum(dim=1) ** 2).sum(dim=-1) - (chances**2).sum(dim=(1, 2))
+    # Per five agents, so that long rings weigh no more than short ones.
+    return loss + settings.clash_weight * pairs.mean() / 2 * 5 / n
+
+
+def _rate(settings: Settings, step: int) -> float:
+    warm = min(1.0, (step + 1) / settings.warmup_steps)
+    low = settings.last_rate_share
+    return settings.rate * warm * (low + (1 - low) * 0.5 * (1 + float(np.cos(np.pi * step / settings.steps))))
+
+
+@dataclass
+class _Run:
+    """All that a checkpoint holds."""
+
+    network: RingNetwork
+    average: dict[str, Tensor]
+    optimiser: torch.optim.AdamW
+    step: int = 0
+    seconds: float = 0.0  # of processor time
+
+    def save(self, path: Path, settings: Settings) -> None:
+        part = path.with_suffix(".part")
+        torch.save(
+            {
+                "network": self.network.state_dict(),
+                "average": self.average,
+                "optimiser": self.optimiser.state_dict(),
+                "step": self.step,
+                "seconds": self.seconds,
+                "settings": asdict(settings),
+            },
+            part,
+        )
+        part.replace(path)  # whole or not at all: a kill while writing keeps the last one
+
+    def load(self, path: Path, settings: Settings) -> None:
+        """Take up a checkpoint; ValueError where it was made with other settings."""
+        state = torch.load(path, weights_only=True)
+        before = state["settings"]
+        changed = [name for name, now in asdict(settings).items() if before.get(name) != now]
+        if changed:
+            raise ValueError(
+                f"{path}: made with other settings ({', '.join(changed)}); give another --out to start anew"
+            )
+        self.network.load_state_dict(state["network"])
+        self.optimiser.load_state_dict(state["optimiser"])
+        self.average, self.step, self.seconds = state["average"], state["step"], state["seconds"]
+
+    def follow(self, decay: float) -> None:
+        """Move the running mean of the weights a step towards them; faster while they are young."""
+        decay = min(decay, (1 + self.step) / (10 + self.step))
+        with torch.no_grad():
+            for name, value in self.network.state_dict().items():
+                self.average[name].lerp_(value, 1 - decay)
+
+
+def _start(settings: Settings) -> _Run:
+    torch.manual_seed(settings.seed)
+    network = RingNetwork()
+    average = {name: value.clone() for name, value in network.state_dict().items()}
+    optimiser = torch.optim.AdamW(network.parameters(), lr=settings.rate, weight_decay=settings.weight_decay)
+    return _Run(network, average, optimiser)
+
+
+def _step(run: _Run, settings: Settings) -> float:
+    """One step of the optimiser; returns the loss."""
+    random = np.random.default_rng([settings.seed, APART, run.step])
+    batch = mixed_batch(random)
+    seen, allowed, delivered, labels = batch_tensors(batch, random)
+    for group in run.optimiser.param_groups:
+        group["lr"] = _rate(settings, run.step)
+    loss = assignment_loss(run.network(seen, allowed, delivered), labels, batch.costs.shape[2], settings)
+    if not torch.isfinite(loss):
+        raise FloatingPointError(
+            f"the loss is {loss.item()} at step {run.step}: lower Settings.rate ({settings.rate})"
+        )
+    run.optimiser.zero_grad(set_to_none=True)
+    loss.backward()  # type: ignore[no-untyped-call]
+    torch.nn.utils.clip_grad_norm_(run.network.parameters(), 1.0)
+    run.optimiser.step()
+    run.step += 1
+    run.follow(settings.average_decay)
+    return float(loss.item())
+
+
+def train(out: Path, settings: Settings, stop_after: int | None = None) -> Path:
+    """Train into the folder `out`, from its checkpoint if there is one, and export; returns the weights.
+
+    `stop_after` ends the run at that step, as a kill would; the next call goes on from the last checkpoint.
+    """
+    torch.set_num_threads(1)
+    out.mkdir(parents=True, exist_ok=True)
+    run, checkpoint = _start(settings), out / "checkpoint.pt"
+    if checkpoint.is_file():
+        run.load(checkpoint, settings)
+        print(f"goes on at step {run.step} of {settings.steps}", flush=True)
+    begun, losses = time.process_time() - run.seconds, []
+    while run.step < min(settings.steps, stop_after or settings.steps):
+        losses.append(_step(run, settings))
+        run.seconds = time.process_time() - begun
+        if run.step % 100 == 0:
+            print(f"step {run.step} loss {np.mean(losses):.4f} seconds {run.seconds:.0f}", flush=True)
+            losses = []
+        if run.step % settings.save_every_steps == 0:
+            run.save(checkpoint, settings)
+    run.save(checkpoint, settings)
+    return checkpoint
