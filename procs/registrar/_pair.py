@@ -22,6 +22,8 @@ AXIS_OUTLIER = (
 )
 FAR_SHARE, FAR_FACTOR = 0.01, 3.0  # share of animals that moved further than the rest, and by how much
 BORDER = 0.25  # body sizes over which "inside the other image" fades at its border
+# Share of view pairs that look at one place, and how far apart their middles lie then, in image sides.
+OVERLAP_SHARE, OVERLAP_STD = 0.5, 0.15
 HEADING_OUTLIER = 0.05  # chance that a heading prior is plain wrong
 ANGLE_BINS = 60
 
@@ -83,6 +85,8 @@ class Pair:
             _axis_vectors(self.source.shapes),
             _axis_vectors(self.target.shapes),
         )
+        # Two cameras that look at one pod look at about one place; a map says nothing of where a view lies.
+        self.views_overlap = source.window is not None and target.window is not None
         self.source_window, self.target_window = _window(self.source), _window(self.target)
         # The smaller of the two covers: where an unmatched box might be in either view.
         self.area = max(min(_polygon_area(self.source_window), _polygon_area(self.target_window)), 4.0)
@@ -144,7 +148,7 @@ class Pair:
         return np.asarray(np.log(self.area / (2 * np.pi * scale2))[:, None, :] + np.log(shape + 1e-30))
 
     def transform_prior(self, homographies: Array) -> Array:
-        """(K, 3, 3) -> (K,) log prior of the rotation, the scale and the position where given."""
+        """(K, 3, 3) -> (K,) log prior of the rotation, the scale, the position and the overlap where given."""
         total = np.zeros(len(homographies))
         alpha = similarity_part(homographies)
         if self.prior.rotation_rad is not None:
@@ -162,6 +166,12 @@ class Pair:
             mapped, _ = apply_homographies(homographies, self.prior.anchor[None])
             chi2 = ((mapped[:, 0] - centre) ** 2).sum(axis=1) / std**2
             total += np.log(np.exp(-chi2 / 2) + 1e-6)
+        if self.views_overlap:
+            middle = self.source_window.mean(axis=0)[None]
+            apart = apply_homographies(homographies, middle)[0][:, 0] - self.target_window.mean(axis=0)
+            share2 = (apart**2).sum(axis=1) / _polygon_area(self.target_window)
+            near = np.exp(-share2 / (2 * OVERLAP_STD**2)) / (2 * np.pi * OVERLAP_STD**2)
+            total += np.log(OVERLAP_SHARE * near + 1 - OVERLAP_SHARE)
         return total
 
     def insideness(self, homographies: Array, mapped: Array) -> tuple[Array, Array]:

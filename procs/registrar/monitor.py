@@ -18,6 +18,7 @@ from procs.registrar.map import MapAnimal
 __all__ = ["MapNames", "name_by_map"]
 
 POSITION_STD_M = 2.5  # of GPS, attitude and what the animals swam since the map was made, together
+FARTHEST_STDS = 3.0
 SCALE_STD = 0.08  # of ln(height): barometers drift by metres
 
 
@@ -59,7 +60,11 @@ def name_by_map(
     prior = Prior(
         (0.0, heading_std_rad), (0.0, SCALE_STD), position=(np.zeros(2), position_std_m), anchor=np.zeros(2)
     )
-    found = align_marks(marks, map_marks(animals, here, view.yaw_rad), prior=prior)
+    target = map_marks(animals, here, view.yaw_rad)
+    found = align_marks(marks, target, prior=prior)
     for row, column in found.matches:
-        identities[row] = animals[column].id
+        # Registration lays even a lone stranger on some animal; the pose says how far is too far.
+        reach = FARTHEST_STDS * np.hypot(position_std_m, heading_std_rad * np.linalg.norm(marks.centres[row]))
+        if np.linalg.norm(marks.centres[row] - target.centres[column]) <= reach:
+            identities[row] = animals[column].id
     return MapNames(identities, found.confidence, found.is_ambiguous)
