@@ -13,9 +13,10 @@ from drivers.cameras.pinhole import Pose, apply_homography
 from procs.registrar._literal import corner_costs, corners_of
 from procs.registrar.map import Memory
 from procs.registrar.ring import RingRegistration
-from tools.bench.registration_cells import PAIRS, PROMISES, RINGS, Promise, row_of
+from tools.bench.registration_cells import MONITOR, PAIRS, PROMISES, RINGS, Promise, row_of
 from tools.bench.registration_composite import FRAME_SIZE, VIEW_SIZE, composite_views
 from tools.bench.registration_figure import AXES, POINTS, draw
+from tools.bench.registration_monitor import draw_monitor, monitor_counts
 from tools.bench.registration_pairs import pair_counts, pair_success
 from tools.bench.registration_peers import METHODS, PEERS, peer_key, peer_matches, peer_table
 from tools.bench.registration_pixels import pixel_rows
@@ -179,6 +180,23 @@ def test_a_symmetric_layout_is_its_own_half_turn_or_mirror_image_but_for_a_littl
 def test_an_unknown_layout_is_refused_with_those_there_are():
     with pytest.raises(ValueError, match="'heap': choose 'crowd' or one of grid, ring, line, mirror"):
         draw_centres(6, np.random.default_rng(2), "heap")
+
+
+def test_in_monitor_each_drone_sees_its_own_animal_and_shares_up_to_three_boxes_with_a_neighbour():
+    shared, apart = [], []
+    for trial in range(60):
+        scene = draw_monitor(MONITOR, trial_rng(5, MONITOR.name, trial))
+        seen = [set(view.animals.tolist()) for view in scene.views]
+        assert all(seen)
+        shared += [len(seen[row] & seen[(row + 1) % 5]) for row in range(5)]
+        assert [animal.id for animal in scene.animals] == list(range(7))
+        for view, believed in zip(scene.views, scene.believed, strict=True):
+            apart.append([believed.n_m - view.pose.n_m, believed.e_m - view.pose.e_m])
+            under = [(one.n_m, one.e_m) for one in scene.animals if one.id in view.animals]
+            nearest = np.linalg.norm(np.array(under) - [view.pose.n_m, view.pose.e_m], axis=1).min()
+            assert nearest < 8.0  # over one of them
+    assert set(shared) == {0, 1, 2, 3}
+    assert np.std(apart) == pytest.approx(1.5, rel=0.1)
 
 
 # what is counted
@@ -350,6 +368,11 @@ def test_rings_in_small(name, rings, least):
     success = ring_success(named(name), rings, seed=11)
     assert success["right"] >= least
     assert success["wrongly_called"] == 0.0
+
+
+def test_monitor_in_small():
+    counts = monitor_counts(MONITOR, 11, range(15))
+    assert counts["right"] / counts["boxes"] >= 0.96
 
 
 def test_the_command_prints_its_rows_and_writes_them(tmp_path):

@@ -11,7 +11,8 @@ from pathlib import Path
 
 from rich.console import Console
 
-from tools.bench.registration_cells import EPISODES, PAIRS, PROMISES, RINGS, row_of
+from tools.bench.registration_cells import EPISODES, MONITOR, PAIRS, PROMISES, RINGS, row_of
+from tools.bench.registration_monitor import monitor_counts
 from tools.bench.registration_pairs import pair_counts, pair_success
 from tools.bench.registration_peers import METHODS, peer_counts, peer_key, peer_table
 from tools.bench.registration_rings import episode_counts, is_ring_right, ring_counts, ring_success
@@ -98,6 +99,8 @@ def _promised_tasks(wanted: Iterable[str], pairs: int, rings: int, seed: int) ->
     for cell in PAIRS:
         if cell.name in chosen:
             yield from in_chunks(cell.name, pair_counts, (cell, seed), pairs, 50)
+    if MONITOR.name in chosen:
+        yield from in_chunks(MONITOR.name, monitor_counts, (MONITOR, seed), rings, 25)
 
 
 def _peer_tasks(cells: Iterable[Cell], pairs: int, seed: int) -> Iterator[Task]:
