@@ -148,7 +148,7 @@ class Pair:
         return np.asarray(np.log(self.area / (2 * np.pi * scale2))[:, None, :] + np.log(shape + 1e-30))
 
     def transform_prior(self, homographies: Array) -> Array:
-        """(K, 3, 3) -> (K,) log prior of the rotation, the scale, the position and the overlap where given."""
+        """(K, 3, 3) -> (K,) log prior of the rotation, the scale, the position, the overlap."""
         total = np.zeros(len(homographies))
         alpha = similarity_part(homographies)
         if self.prior.rotation_rad is not None:
