@@ -16,6 +16,8 @@ __all__ = ["corner_costs", "literal_alignment"]
 Array = NDArray[np.float64]
 
 MAX_ITERATIONS = 60
+IDENTITY = np.eye(3)
+SETTLED = 1e-5  # a step that turns, scales and shifts (px) by no more than this changes no assignment
 PERMUTATIONS = np.array(
     list(permutations(range(4)))
 )  # (24, 4): corner of the target for each corner of the source
@@ -29,43 +31,41 @@ def corners_of(boxes: Array) -> Array:
     return np.asarray(boxes[:, [0, 1, 2, 1, 2, 3, 0, 3]].reshape(-1, 4, 2))
 
 
-def corner_costs(source: Array, target: Array) -> tuple[Array, NDArray[np.intp]]:
-    """(N1, 4, 2) and (N2, 4, 2) corners -> the best total corner distance (N1, N2) and its permutation (N1,
-    N2).
+def corner_costs(source: Array, target: Array) -> tuple[Array, Array]:
+    """(N1, 4, 2) and (N2, 4, 2) corners -> the best total corner distance (N1, N2), and the totals of all
+    permutations (24, N1, N2).
     """
-    flat_source = source.reshape(-1, 2) @ np.array([1.0, 1.0j])
-    flat_target = target.reshape(-1, 2) @ np.array([1.0, 1.0j])
-    distances = np.abs(flat_source[:, None] - flat_target[None, :])
-    blocks = distances.reshape(len(source), 4, len(target), 4).transpose(0, 2, 1, 3)
-    totals = (blocks.reshape(-1, 16) @ ONE_HOT).reshape(len(source), len(target), 24)
-    best = totals.argmin(axis=2)
-    return np.take_along_axis(totals, best[:, :, None], axis=2)[:, :, 0], best
+    ours, theirs = source.transpose(2, 1, 0)[:, :, None, :, None], target.transpose(2, 1, 0)[:, None, :, None]
+    across, down = ours[0] - theirs[0], ours[1] - theirs[1]
+    across *= across
+    down *= down
+    across += down
+    distances = np.sqrt(across, out=across).reshape(16, -1)
+    totals = (ONE_HOT.T @ distances).reshape(24, len(source), len(target))
+    return totals.min(axis=0), totals
 
 
 def literal_alignment(source: Array, target: Array) -> tuple[Array, NDArray[np.intp], Array, int]:
     """(N1, 4) and (N2, 4) boxes -> transform (3, 3), matches (K, 2), corner cost of each match (K,) px,
     iterations.
     """
-    transform = np.eye(3)
+    transform, step = np.eye(3), np.eye(3)
     corners, goals = corners_of(source), corners_of(target)
     previous = None
     iterations = 0
     while iterations < MAX_ITERATIONS:
         iterations += 1
-        costs, best = corner_costs(corners, goals)
+        costs, totals = corner_costs(corners, goals)
         rows, columns = linear_sum_assignment(costs)
-        points = corners[rows].reshape(-1, 2)
-        wanted = np.take_along_axis(
-            goals[columns], PERMUTATIONS[best[rows, columns]][:, :, None], axis=1
-        ).reshape(-1, 2)
-        design = np.column_stack([points, np.ones(len(points))])
-        solution = np.linalg.lstsq(design, wanted, rcond=None)[0]
-        step = np.eye(3)
-        step[:2] = solution.T
+        turned = totals[:, rows, columns].argmin(axis=0)
+        wanted = goals[columns[:, None], PERMUTATIONS[turned]].reshape(-1, 2)
+        design = np.ones((4 * len(rows), 3))
+        design[:, :2] = corners[rows].reshape(-1, 2)
+        step[:2] = np.linalg.lstsq(design, wanted, rcond=None)[0].T
         transform = step @ transform
         corners = corners @ step[:2, :2].T + step[:2, 2]
-        state = (columns.tolist(), best[rows, columns].tolist())
-        if state == previous and np.allclose(step, np.eye(3), atol=1e-6):
+        state = (columns.tolist(), turned.tolist())
+        if state == previous and np.abs(step - IDENTITY).max() < SETTLED:
             break
         previous = state
     return transform, np.column_stack([rows, columns]), costs[rows, columns], iterations
