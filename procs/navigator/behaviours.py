@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from drivers.cameras.pinhole import Pinhole
 from lcmtypes import podwatch
+from procs.navigator import surplus
 from procs.navigator.flight import approach, inside_fence
 from procs.navigator.formation import circle_radius, gather_height, slot
 from procs.navigator.situation import WAITS, Find, Memory, Situation, Step, episode_key
@@ -83,6 +84,7 @@ def standby(now: Situation, memory: Memory, camera: Pinhole) -> Step:
     assignment = now.inputs.assignment
     if memory.surplus and memory.find is not None:
         step = fly_to(now, surplus_place(now, memory.find, camera), now.mission.watch.speed_m_s)
+        step.wants_episode = surplus.asks(now, memory)
         if assignment is not None and assignment.certified and assignment.animal >= 0:
             memory.animal, memory.assigned_key = assignment.animal, episode_key(assignment)
             step.event = Event.CERTIFIED

@@ -57,9 +57,7 @@ def overriding_events(now: Situation, memory: Memory) -> list[Event]:
         events.append(Event.ORDER_HOLD)
     if _is_blind(now, memory):
         events.append(Event.BLIND)
-    if memory.watch_since_us and (
-        now.seconds_since(memory.watch_since_us) > now.mission.watch.watch_s + WATCH_MARGIN_S
-    ):
+    if memory.watched_us * 1e-6 > now.mission.watch.watch_s + WATCH_MARGIN_S:
         events.append(Event.WATCHED)
     if _fleet_returns(now, memory):
         events.append(Event.FLEET_RETURNS)

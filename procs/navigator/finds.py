@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from drivers.cameras.pinhole import Pinhole
 from procs.navigator.servo import ground_points
 from procs.navigator.situation import Find, Memory, Situation
-from procs.navigator.states import IN_CIRCLE, State
+from procs.navigator.states import GATHERED, IN_CIRCLE, State
 
 __all__ = ["keep_clock", "sense", "share"]
 
@@ -19,6 +19,8 @@ STRAY_M = 15.0  # boxes further than this outside the pod are not of the pod
 FRESH_MAP_S = 10.0
 INSET = 0.1  # share of the picture's sides near which an animal may be cut off
 PERIOD_S = 0.5  # at which the drift of the find is estimated
+LONGEST_STEP_US = 1_000_000  # of the watch's clock: an update that came late counts no more
+UNSEEN_S = 1.0  # its animal unseen for longer: this is not watching
 JOIN_S = 10.0  # the watch begins at the latest so long after the first drone's MONITOR
 LOOKING = (State.SCOUT, State.FOUND, State.RENDEZVOUS, State.REGISTER)
 
@@ -116,16 +118,21 @@ def _follow(now: Situation, memory: Memory, ne: Array, radius_m: float) -> None:
 
 
 def keep_clock(now: Situation, memory: Memory) -> None:
-    """The fleet's watch begins when somebody watches and nobody gathers any more, or 10 s after the first."""
+    """Count how long the fleet has watched: while somebody watches and nobody gathers, or from 10 s after the
+    first began.
+
+    It stands still while the fleet gathers anew, and while this drone watches and does not see its animal:
+    what was watched before counts, what nobody saw does not.
+    """
+    passed_us = min(now.utime - memory.clock_us, LONGEST_STEP_US) if memory.clock_us else 0
+    memory.clock_us = now.utime
     states = [State(row.state) for row in now.others] + [memory.state]
-    watching = State.MONITOR in states
-    gathering = any(state in (State.RENDEZVOUS, State.REGISTER, State.ASSIGN) for state in states)
-    if not watching:
+    if State.MONITOR not in states:
         memory.first_watch_us = 0
-        if gathering:
-            memory.watch_since_us = 0
         return
     memory.watch_seen = True
     memory.first_watch_us = memory.first_watch_us or now.utime
-    if memory.watch_since_us == 0 and (not gathering or now.seconds_since(memory.first_watch_us) > JOIN_S):
-        memory.watch_since_us = now.utime
+    gathering = any(state in GATHERED for state in states)
+    is_blind = memory.state == State.MONITOR and now.seconds_since(memory.seen_us) > UNSEEN_S
+    if not is_blind and (not gathering or now.seconds_since(memory.first_watch_us) > JOIN_S):
+        memory.watched_us += passed_us

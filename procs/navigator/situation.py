@@ -113,7 +113,12 @@ class Memory:
     sight_us: int = 0  # capture time of the newest detections heard in any state
     detections_us: int = 0  # capture time of the newest detections that were taken in
     first_watch_us: int = 0  # when the first drone was seen in MONITOR, 0 while none is
-    watch_since_us: int = 0  # when the fleet began MONITOR, 0 before
+    watched_us: int = 0  # for how long the fleet has watched so far, in all
+    clock_us: int = 0  # when that was last counted on
+    free_since_us: int = 0  # since when a surplus drone sees animals that nobody watches, 0 while it does not
+    free_animals: tuple[int, ...] = ()  # those
+    free_key: EpisodeKey = (0, 0)  # newest episode that had ended when they were looked at last
+    n_asked: int = 0  # episodes that have ended and left them to nobody
     held_us: int = 0  # last instant of doubt
     pilot_us: int = 0  # last instant at which the pilot had it
     watch_seen: bool = False  # it has seen the fleet watch, at any time
