@@ -96,6 +96,7 @@ class WatchSettings(Section):
 class AssignSettings(Section):
     """Who watches which animal."""
 
+    method: Literal["auto", "exact", "gnn", "gnn+resolve"] = "auto"  # auto: procs.assigner.rule decides
     gain_m: float = Field(5.0, ge=0, le=500)  # saved for each drone that changes its animal
     minute_watched_m: float = Field(1.0, ge=0, le=100)  # an animal is so much dearer a minute watched by any
 

@@ -2,9 +2,9 @@
 4).
 
 Every packet is whole state: which rows, choices, confirmations and releases the sender holds, all choices,
-and a window of rows that goes round. Losing, repeating or reordering packets costs time and nothing else. An
-agent decides when it holds every living member's row: all solve the same table and find the same answer. It
-moves only with the certificate: it holds every member's choice, no two are the same, and who watched the
+and a window of rows that goes round. Losing, repeating or reordering packets costs time and nothing else.
+An agent decides when it holds every living member's row: all solve the same table and find the same answer.
+It moves only with the certificate: it holds every member's choice, no two are the same, and who watched the
 animal until now has let go of it. A holder lets go when everybody has confirmed that all choices are held
 and distinct; so nobody takes an animal that its holder may still watch, and nobody gives one up for an
 exchange that never ends.
@@ -18,7 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from procs.assigner.costs import FORBIDDEN, cost_codes, solve_table
-from procs.assigner.packets import MOST_LISTED, NO_ID, Packet, Row, decode, encode, row_room
+from procs.assigner.packets import MOST_LISTED, NO_ID, SAID_HEADER, Packet, Row, decode, encode, row_room
+from procs.assigner.rounds import RoundTalk, learned_bytes
+from procs.assigner.solve import Method, agent_for
 
 __all__ = ["Agent"]
 
@@ -30,12 +32,13 @@ class Agent:
     """One member's side of the exchange for one episode.
 
     index, n_members: its place among the episode's members, in ring order, 0 first. own_costs (G,): metres
-    on the ground to each of `goals` (G animal ids, 0-254); inf forbids. previous: the animal that it watches
-    already, -1 none. forbidden: ids that it must not take (ordered to leave, or watched by a drone that is
-    no member). threshold_m: gain for which it is worth to change. listed: it tells the others of so many
-    animals, the nearest, and of its own and the forbidden ones; None: of all. Raises ValueError for arguments
-    that cannot be: an index outside the members, costs and goals of different lengths, an id outside 0-254 or
-    named twice, a row too long for a packet.
+    on the ground to each of `goals` (G animal ids, 0-254); inf forbids. previous: the animal that it
+    watches already, -1 none. forbidden: ids that it must not take (ordered to leave, or watched by a drone
+    that is no member). threshold_m: gain for which it is worth to change. listed: it tells the others of so
+    many animals, the nearest, and of its own and the forbidden ones; None: of all. method: what decides,
+    the same for all members; with a learned one rows name the animal watched so far and nothing else.
+    Raises ValueError for arguments that cannot be: an index outside the members, costs and goals of
+    different lengths, an id outside 0-254 or named twice, a row or a learned message too long for a packet.
     """
 
     def __init__(
@@ -49,6 +52,7 @@ class Agent:
         forbidden: Sequence[int] = (),
         threshold_m: float = 5.0,
         listed: int | None = None,
+        method: Method = "exact",
     ) -> None:
         if not 0 <= index < n_members <= 99:
             raise ValueError(f"index {index} of {n_members} members: there are 1 to 99, counted from 0")
@@ -64,7 +68,12 @@ class Agent:
         costs[[k for k, goal in enumerate(goals) if goal in forbidden]] = np.inf
         self.index, self.n_members, self.threshold_m = index, n_members, threshold_m
         previous = previous if previous not in forbidden else -1
-        row = _own_row(costs, [int(goal) for goal in goals], previous, listed)
+        is_exact = method == "exact"
+        row = (
+            _own_row(costs, [int(goal) for goal in goals], previous, listed)
+            if is_exact
+            else Row((), (), previous)
+        )
         self._may_take = sorted(
             int(goal) for goal, cost in zip(goals, costs, strict=True) if np.isfinite(cost)
         )
@@ -74,6 +83,7 @@ class Agent:
             raise ValueError(
                 f"{len(row.ids)} goals: a packet for {n_members} members has room for {most}; list fewer"
             )
+        self._talk = None if is_exact else self._learned(costs, goals, previous, method)
         self.rows: dict[int, Row] = {index: row}
         self._choices: dict[int, int] = {}
         self._confirmed: set[int] = set()
@@ -85,6 +95,25 @@ class Agent:
         self._spoke_s = -np.inf
         self.n_bad = 0
         self.clash = False  # two members chose one animal: this episode ends without a certificate
+
+    def _learned(
+        self, costs: NDArray[np.float64], goals: Sequence[int], previous: int, method: Method
+    ) -> RoundTalk:
+        """The rounds of a learned method; columns in the order of the ids. The animal held counts as
+        cheaper.
+        """
+        order = np.argsort(goals)
+        self._ids = [int(goals[k]) for k in order]
+        held = np.array([goal == previous for goal in goals], dtype=bool)
+        costs = np.where(held, np.maximum(costs - self.threshold_m, 0.0), costs)
+        longest = learned_bytes(len(goals))
+        if longest > self._room:
+            raise ValueError(
+                f"{len(goals)} goals: a message of {method} takes {longest} bytes and a packet for "
+                f"{self.n_members} members has room for {self._room}; use the exact method"
+            )
+        learner = agent_for(method, costs[order], self.index, self.n_members)
+        return RoundTalk(learner, self.index, self.n_members, self._ids)
 
     @property
     def living(self) -> list[int]:
@@ -129,6 +158,8 @@ class Agent:
             raise ValueError(f"member {index} is this agent itself; it cannot drop itself")
         self._dropped.add(index)
         self._heard.pop(index, None)
+        if self._talk is not None:
+            self._talk.drop(index)
         self._advance()
 
     def step(self, inbox: Sequence[bytes], now_s: float) -> list[bytes]:
@@ -146,6 +177,8 @@ class Agent:
                 self._take(packet)
             else:
                 self.n_bad += 1
+        if self._talk is not None and self.choice is None:
+            self._talk.step(now_s)
         self._advance()
         if self.n_members == 1 or (self._all_told() and now_s - self._spoke_s < REPEAT_S):
             return []
@@ -159,6 +192,9 @@ class Agent:
                 # One's own row from a neighbour is the row of before a restart: the fleet may have decided
                 # on it.
                 self.rows[member] = row
+        for to, number, data in packet.said:
+            if self._talk is not None and to == self.index:
+                self._talk.hear(packet.sender, number, data)
         for member, animal in packet.choices.items():
             known = self._choices.setdefault(member, animal)
             self.clash = self.clash or known != animal
@@ -166,10 +202,14 @@ class Agent:
         self._released |= packet.released
 
     def _advance(self) -> None:
-        """Decide once every living member's row is here; a decision is never changed, for others may have
-        moved on it.
+        """Decide once every living member's row is here, or the learned rounds are over; a decision is
+        never changed, for others may have moved on it.
         """
-        if self.choice is None and all(k in self.rows for k in self.living):
+        if self.choice is not None:
+            pass
+        elif self._talk is not None and self._talk.is_over:
+            self._choices[self.index] = self._ids[self._talk.goal] if self._talk.goal >= 0 else -1
+        elif self._talk is None and all(k in self.rows for k in self.living):
             self._choices[self.index] = self._solve()
         if not self._all_distinct():
             return
@@ -241,17 +281,23 @@ class Agent:
         )
 
     def _packet(self) -> Packet:
+        said: list[tuple[int, int, bytes]] = []
+        room = self._room
+        if self._talk is not None:
+            decided = [k for k, packet in self._heard.items() if k in packet.choices]
+            for message in self._talk.to_say(decided):
+                size = SAID_HEADER + len(message[2])
+                if size <= room:
+                    said.append(message)
+                    room -= size
+        held = frozenset(self.rows)
+        confirmed, released = frozenset(self._confirmed), frozenset(self._released)
+        rows = self._window(room)
         return Packet(
-            self.index,
-            self.n_members,
-            frozenset(self.rows),
-            dict(self._choices),
-            frozenset(self._confirmed),
-            frozenset(self._released),
-            self._window(),
+            self.index, self.n_members, held, dict(self._choices), confirmed, released, rows, tuple(said)
         )
 
-    def _window(self) -> dict[int, Row]:
+    def _window(self, room: int) -> dict[int, Row]:
         """Rows that some neighbour lacks, as many as fit, from where the last packet ended; its own where
         nobody was heard.
         """
@@ -262,7 +308,6 @@ class Agent:
         wanted = sorted(lacking | echoed if self._heard else self.rows)
         start = next((i for i, k in enumerate(wanted) if k >= self._next_row), 0)
         window: dict[int, Row] = {}
-        room = self._room
         for k in wanted[start:] + wanted[:start]:
             if self.rows[k].n_bytes > room:
                 break

@@ -1,9 +1,10 @@
 """What travels in RING_ASSIGN: one member's whole state as bytes (DESIGN section 4).
 
 Packet: version, sender, n_members (1 byte each); four bitmaps by member index (rows, choices, confirmed,
-released), lowest bit first; 1 byte an animal id for each choice held, 255 for none; then rows up to the end:
-member, previous animal (255 none), n (1 byte each; its highest bit says that the row is cut), n ids (1 byte),
-n costs (2 bytes, little-endian, costs.py).
+released), lowest bit first; 1 byte an animal id for each choice held, 255 for none; the number of messages
+of a learned method's rounds (1 byte), each its receiver, round (1 byte each), length (2 bytes) and bytes;
+then rows up to the end: member, previous animal (255 none), n (1 byte each; its highest bit says that the
+row is cut), n ids (1 byte), n costs (2 bytes, little-endian, costs.py).
 """
 
 from collections.abc import Iterable
@@ -11,21 +12,22 @@ from dataclasses import dataclass
 
 import numpy as np
 
-__all__ = ["MAX_PACKET_BYTES", "NO_ID", "Packet", "Row", "decode", "encode", "row_room"]
+__all__ = ["MAX_PACKET_BYTES", "NO_ID", "SAID_HEADER", "Packet", "Row", "decode", "encode", "row_room"]
 
 MAX_PACKET_BYTES = 308  # the paper's bound on what a neighbour is sent
 VERSION = 2
 NO_ID = 255
 CUT = 0x80
 MOST_LISTED = 0x7F
+SAID_HEADER = 4
 
 
 @dataclass(frozen=True)
 class Row:
     """One member's costs: `codes` for the animals `ids`, and the animal that it watches already (-1 none).
 
-    is_cut: it lists its nearest animals only; the others would do too, at more than the dearest listed. What
-    a whole row does not list, its drone does not know.
+    is_cut: it lists its nearest animals only; the others would do too, at more than the dearest listed.
+    What a whole row does not list, its drone does not know.
     """
 
     ids: tuple[int, ...]
@@ -40,7 +42,9 @@ class Row:
 
 @dataclass(frozen=True)
 class Packet:
-    """What one member says it holds; `rows` are a window of the rows in `rows_held`."""
+    """What one member says it holds; `rows` are a window of the rows in `rows_held`; `said`: to whom,
+    round, bytes.
+    """
 
     sender: int
     n_members: int
@@ -49,11 +53,12 @@ class Packet:
     confirmed: frozenset[int]  # they hold every member's choice, all distinct
     released: frozenset[int]  # they have let go of the animal that they watched before
     rows: dict[int, Row]
+    said: tuple[tuple[int, int, bytes], ...] = ()
 
 
 def row_room(n_members: int) -> int:
     """Bytes that a packet leaves for rows once all members' choices are held."""
-    return MAX_PACKET_BYTES - 3 - 4 * ((n_members + 7) // 8) - n_members
+    return MAX_PACKET_BYTES - 4 - 4 * ((n_members + 7) // 8) - n_members
 
 
 def _bitmap(indices: Iterable[int], n: int) -> bytes:
@@ -69,6 +74,10 @@ def encode(packet: Packet) -> bytes:
         _bitmap(held, n) for held in (packet.rows_held, packet.choices, packet.confirmed, packet.released)
     ]
     parts.append(bytes(packet.choices[k] % 256 for k in sorted(packet.choices)))
+    parts.append(bytes([len(packet.said)]))
+    parts += [
+        bytes([to, number]) + len(data).to_bytes(2, "little") + data for to, number, data in packet.said
+    ]
     for member in sorted(packet.rows):
         row = packet.rows[member]
         count = len(row.ids) | (CUT if row.is_cut else 0)
@@ -115,12 +124,21 @@ def decode(data: bytes) -> Packet:
     confirmed = reader.members(n, "the confirmations' bitmap")
     released = reader.members(n, "the releases' bitmap")
     ids = reader.take(len(chosen), "the choices")
+    said = tuple(_said(reader, n) for _ in range(reader.take(1, "the rounds")[0]))
     rows = {}
     while reader.at < len(data):
         member, row = _row(reader, n)
         rows[member] = row
     choices = {k: -1 if animal == NO_ID else animal for k, animal in zip(chosen, ids, strict=True)}
-    return Packet(sender, n, frozenset(rows_held), choices, frozenset(confirmed), frozenset(released), rows)
+    held = frozenset(rows_held)
+    return Packet(sender, n, held, choices, frozenset(confirmed), frozenset(released), rows, said)
+
+
+def _said(reader: _Reader, n: int) -> tuple[int, int, bytes]:
+    to, number, *size = reader.take(SAID_HEADER, "a round's header")
+    if to >= n:
+        raise ValueError(f"message of a round to member {to}: there are only {n}")
+    return to, number, reader.take(int.from_bytes(bytes(size), "little"), "a round's message")
 
 
 def _row(reader: _Reader, n: int) -> tuple[int, Row]:

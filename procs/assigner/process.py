@@ -22,7 +22,7 @@ from lcmtypes.podwatch import (
     vehicle_state_t,
 )
 from procs.assigner.gossip import Agent
-from procs.assigner.rule import rows_listed
+from procs.assigner.rule import plan
 from procs.assigner.watched import WatchBook
 from procs.navigator.states import State
 from procs.registrar.episodes import from_bitmap
@@ -111,6 +111,7 @@ class AssignerShell:
         animals = [one for one in there if self._book.may_take(one.id)]
         costs = [self._cost_m(one, vehicle) for one in animals]
         held = [one.id for one in animals if one.age_ms <= PREVIOUS_WITHIN_MS]
+        chosen = plan(len(members), len(animals), self._loss, self._settings.method)
         return Agent(
             members.index(self._runtime.drone_id),
             len(members),
@@ -119,7 +120,8 @@ class AssignerShell:
             previous=self._animal if self._animal in held else -1,
             forbidden=[animal for drone, animal in sorted(self._watched.items()) if drone not in members],
             threshold_m=self._settings.gain_m,
-            listed=rows_listed(len(members), len(animals), self._loss),
+            listed=chosen.listed,
+            method=chosen.method,
         )
 
     def _cost_m(self, animal: map_animal_t, vehicle: vehicle_state_t) -> float:

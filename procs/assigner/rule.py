@@ -9,8 +9,11 @@ below are not those it measures.
 """
 
 from dataclasses import dataclass
+from typing import Literal
 
 from procs.assigner.packets import MOST_LISTED, row_room
+from procs.assigner.rounds import learned_bytes
+from procs.assigner.solve import Method
 
 __all__ = ["DISTINCT", "RATIOS", "Plan", "plan", "rows_listed"]
 
@@ -21,7 +24,7 @@ LIST_BYTES = 10  # what gnn+resolve floods of an agent
 
 # Share of distinct answers after five rounds, worst of three training seeds, at 1, 1.5 and 2 goals an agent.
 RATIOS = (1.0, 1.5, 2.0)
-DISTINCT: dict[str, dict[int, tuple[float, float, float]]] = {
+DISTINCT: dict[Method, dict[int, tuple[float, float, float]]] = {
     "gnn": {5: (0.0, 0.0, 0.0)},
     "gnn+resolve": {5: (0.0, 0.0, 0.0)},
 }
@@ -31,29 +34,35 @@ DISTINCT: dict[str, dict[int, tuple[float, float, float]]] = {
 class Plan:
     """What an episode's members do."""
 
-    method: str  # "exact", "gnn" or "gnn+resolve"
+    method: Method
     listed: int  # animals that a drone's row lists; only the exact method has rows
-    bytes_needed: dict[
-        str, float
-    ]  # by method: what one drone sends, on average, until all choices are distinct
+    bytes_needed: dict[Method, float]  # what one drone sends, on average, until all choices are distinct
 
 
-def plan(n_members: int, n_animals: int, loss: float = 0.0) -> Plan:
-    """The method for n_members drones and n_animals animals on links that lose `loss` of their messages."""
-    listed = rows_listed(n_members, n_animals, loss)
+def plan(
+    n_members: int, n_animals: int, loss: float = 0.0, wanted: Literal["auto"] | Method = "auto"
+) -> Plan:
+    """What n_members drones do about n_animals animals; this drone's links lose `loss` of their messages.
+
+    wanted: the mission's own choice; a learned method whose messages no packet can hold gives way to the
+    exact.
+    """
     learned = 2 * (2 + 6 * n_animals)  # a round, to both sides
     # Without rows the certificate still needs to know who holds what: 3 bytes a member.
     holders = 3 * (n_members - 1)
-    sent = {
-        "exact": float((n_members - 1) * (3 + 3 * listed)),
+    sent: dict[Method, float] = {
+        "exact": float((n_members - 1) * (3 + 3 * rows_listed(n_members, n_animals, 0.0))),
         "gnn": (ROUNDS * learned + holders) / _distinct("gnn", n_members, n_animals),
         "gnn+resolve": (LEARNED_ROUNDS * learned + 4 * LIST_BYTES + holders)
         / _distinct("gnn+resolve", n_members, n_animals),
     }
-    return Plan(min(sent, key=lambda method: sent[method]), listed, sent)
+    method: Method = min(sent, key=lambda name: sent[name]) if wanted == "auto" else wanted
+    if learned_bytes(n_animals) > row_room(n_members):
+        method = "exact"
+    return Plan(method, rows_listed(n_members, n_animals, loss), sent)
 
 
-def _distinct(method: str, n_members: int, n_animals: int) -> float:
+def _distinct(method: Method, n_members: int, n_animals: int) -> float:
     """The measured share of the nearest size that is no harder: no more drones, no fewer animals a drone.
     Never 0.
     """

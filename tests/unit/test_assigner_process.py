@@ -17,6 +17,7 @@ from lcmtypes.podwatch import (
     map_animal_t,
     mission_state_t,
     operator_t,
+    ring_assign_t,
     vehicle_state_t,
 )
 from procs.assigner import process as assigner
@@ -35,7 +36,7 @@ class Fleet:
     """Drones with a relay and an assigner each; the test plays navigator, autopilot and registrar."""
 
     def __init__(
-        self, run_dir: Path, places: Places, loss: float = 0.0, minute_watched_m: float = 1.0
+        self, run_dir: Path, places: Places, loss: float = 0.0, assign: AssignSettings | None = None
     ) -> None:
         self.queue = EventQueue()
         self.places = places
@@ -44,7 +45,7 @@ class Fleet:
         )
         self.mission = Mission(
             drones=tuple(DroneEntry(id=drone_id, home_e_m=10.0 * drone_id) for drone_id in places),
-            assign=AssignSettings(minute_watched_m=minute_watched_m),
+            assign=assign or AssignSettings(),
         )
         self.state = dict.fromkeys(places, State.ASSIGN)
         self.animal = dict.fromkeys(places, -1)
@@ -52,6 +53,7 @@ class Fleet:
         self.buses: dict[int, VirtualBus] = {}
         self.runtimes: dict[int, list[QueueRuntime]] = {}
         self.order = make(operator_t, command=operator_t.NONE, animal=-1)
+        self.largest_packet = 0
         self.follows = True  # the navigators say that they watch what they are given
         for drone_id in places:
             self._start(drone_id, run_dir)
@@ -73,6 +75,8 @@ class Fleet:
         bus.observers.append(lambda channel, data: self._heard(drone_id, channel, data))
 
     def _heard(self, drone_id: int, channel: str, data: bytes) -> None:
+        if channel == channels.RING_ASSIGN:
+            self.largest_packet = max(self.largest_packet, ring_assign_t.decode(data).n_bytes)
         if channel == channels.ASSIGNMENT:
             self.told[drone_id].append(assignment_t.decode(data))
             self._nobody_watches_twice()
@@ -156,6 +160,18 @@ def test_the_fleet_takes_the_cheapest_distinct_animals(run_dir: Path, n: int, lo
     assert all(told.certified and not told.running and not told.surplus for told in fleet.last().values())
 
 
+@pytest.mark.parametrize("method", ["gnn", "gnn+resolve"])
+def test_a_mission_may_ask_for_a_learned_method(run_dir: Path, method: Any) -> None:
+    fleet = Fleet(run_dir, line(5), 0.2, AssignSettings(method=method))
+    # All but one side by side with a drone: no method mistakes these.
+    animals = beside(fleet.places) | {50: (300.0, 3.0)}
+    fleet.episode(1, animals)
+    fleet.run(15.0)
+    assert fleet.animals() == {1: 101, 2: 102, 3: 103, 4: 104, 5: 105}
+    assert all(told.certified for told in fleet.last().values())
+    assert fleet.largest_packet <= 308
+
+
 def test_who_gets_no_animal_is_told_so(run_dir: Path) -> None:
     fleet = Fleet(run_dir, line(3))
     fleet.episode(1, {7: (20.0, 1.0), 9: (60.0, 1.0)})
@@ -226,7 +242,7 @@ def test_an_order_to_leave_passes_the_animal_on(run_dir: Path) -> None:
 def test_minutes_already_watched_make_an_animal_dearer_for_all(run_dir: Path) -> None:
     animals = {7: (20.0, 2.0), 8: (20.0, 12.0)}  # 10 m apart, the gain that it takes to change is 5 m
     for price_m, expected in ((1.0, 7), (20.0, 8)):
-        fleet = Fleet(run_dir, {1: (20.0, 0.0)}, minute_watched_m=price_m)
+        fleet = Fleet(run_dir, {1: (20.0, 0.0)}, assign=AssignSettings(minute_watched_m=price_m))
         fleet.episode(1, animals)
         fleet.run(1.0)
         assert fleet.animals() == {1: 7}
