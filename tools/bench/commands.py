@@ -54,3 +54,16 @@ def bench_registration(
         from tools.bench.registration import command
     with plain_errors():
         command(pairs, rings, seed, only, out)
+
+
+@bench.command("assignment")
+def bench_assignment(
+    seed: Annotated[int, typer.Option(min=0, help="Of the cases.")] = 0,
+    out: Annotated[Path, typer.Option(help="Folder for the table and the figures.")] = Path("runs/bench"),
+    quick: Annotated[bool, typer.Option("--quick", help="Few cases a size, small rings.")] = False,
+) -> None:
+    """The three methods against their bars, the paper's Table 2 and other ways; what flies, and why."""
+    from tools.bench.assignment import command
+
+    with plain_errors():
+        command(seed, out, quick=quick)
