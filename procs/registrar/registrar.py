@@ -12,10 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.cameras.pinhole import Pinhole, Pose, apply_homography
+from procs.registrar._verdict import CONSENSUS_CONFIDENCE
 from procs.registrar.box_icp import BoxAlignment
 from procs.registrar.carry import BoxCarrier, Sighting
 from procs.registrar.episodes import EpisodeBook, Proposal
 from procs.registrar.map import Memory
+from procs.registrar.monitor import name_by_map
 from procs.registrar.ring import NodeResult, RingNode, ViewGeometry
 from procs.registrar.steady import steady
 from procs.registrar.upkeep import Correction, MapBook, MapEntry
@@ -32,9 +34,9 @@ SECOND_LOOK_US = 1_200_000  # a pair's second instant, at least 1 s after the fi
 SAID_AFTER_END_US = 1_500_000  # a finished drone repeats its packets, so that the others end too
 SEEN_NOW_US = 1_000_000
 EDGE_PX = 3.0  # a box this near to the edge is cut by it
-# An unnamed box this near to a mapped animal that no box here is, and far from its rivals, for so many
-# sights running is that animal.
-TAKE_UP_LENGTHS = 0.4
+# How far the corrected pose and the swimming of a few seconds put a box from where the map has its animal,
+# and how many sights running must give an unnamed box the same name.
+TAKE_UP_STD_LENGTHS = 0.15
 TAKE_UP_SIGHTS = 4
 TAKE_UP_WITHIN_US = 8_000_000  # an animal that nobody saw for longer may be another's length away
 CORRECTION_GAIN = 0.05
@@ -211,15 +213,7 @@ class Registrar:
         if (
             pose is not None and pose.height_m > 0
         ):  # on the ground a barometer says less than nothing at times
-            view = ViewGeometry(
-                height_m=pose.height_m,
-                yaw_rad=pose.yaw_rad,
-                n_m=pose.n_m,
-                e_m=pose.e_m,
-                roll_rad=pose.roll_rad,
-                pitch_rad=pose.pitch_rad,
-                focal_px=self._camera.focal_px,
-            )
+            view = self._view(pose)
         options = {} if self._register is None else {"register": self._register}
         memory = None if running.proposal.fresh else self.memory
         first = running.looks[0].node
@@ -328,32 +322,46 @@ class Registrar:
         return entry.seen_fleet_utime if entry is not None else 0
 
     def _take_up(self, sighting: Sighting, pose: Pose, fleet_utime: int) -> None:
-        """Name boxes that have no name by the map, where one animal alone is near enough (DESIGN section 4,
-        MONITOR).
+        """Name boxes that have no name by the map, with this drone's pose as prior (DESIGN section 4,
+        MONITOR); only what several sights running agree on.
         """
-        held = set(self.carrier.held_ids(sighting.utime, SEEN_NOW_US))
-        free = [
+        fresh = [
             entry
             for entry in self.map.entries.values()
-            if entry.animal not in held and fleet_utime - entry.seen_fleet_utime <= TAKE_UP_WITHIN_US
+            if fleet_utime - entry.seen_fleet_utime <= TAKE_UP_WITHIN_US
         ]
-        unnamed = [
-            (animal, self.correction.to_map(position, pose))
-            for animal, position in zip(sighting.followed, sighting.ground_m, strict=True)
-            if animal.animal < 0
-        ]
-        if not free or not unnamed:
+        held = self.carrier.held_ids(sighting.utime, SEEN_NOW_US)
+        if all(one.animal >= 0 for one in sighting.followed) or all(one.animal in held for one in fresh):
             return
-        places = np.array([entry.position_m for entry in free])
-        distance = np.array([np.linalg.norm(places - here, axis=1) for _, here in unnamed])
-        reach = TAKE_UP_LENGTHS * self._length_m
-        for row, (animal, _) in enumerate(unnamed):
-            column = int(np.argmin(distance[row]))
-            rivals = np.append(np.delete(distance[row], column), np.delete(distance[:, column], row))
-            clear = distance[row, column] <= reach and bool(np.all(rivals > 2 * reach))
-            offer = free[column].animal if clear else -1
-            if animal.offered(offer) >= TAKE_UP_SIGHTS and offer >= 0:
-                self.carrier.name_one(animal, offer)
+        names = name_by_map(
+            sighting.boxes,
+            [entry.unturned() for entry in fresh],
+            self._view(self.correction.pose(pose)),
+            image_size=self._camera.image_size,
+            position_std_m=TAKE_UP_STD_LENGTHS * self._length_m,
+        )
+        offers = names.identities.tolist()
+        is_sure = names.confidence >= CONSENSUS_CONFIDENCE and all(
+            one.animal < 0 or offer in (-1, one.animal)
+            for one, offer in zip(sighting.followed, offers, strict=True)
+        )
+        whole = self._whole(sighting.boxes)
+        for one, offer, is_whole in zip(sighting.followed, offers, whole, strict=True):
+            if one.animal < 0:
+                taken = offer if is_sure and is_whole and offer not in held else -1
+                if one.offered(taken) >= TAKE_UP_SIGHTS and taken >= 0:
+                    self.carrier.name_one(one, taken)
+
+    def _view(self, pose: Pose) -> ViewGeometry:
+        return ViewGeometry(
+            height_m=pose.height_m,
+            yaw_rad=pose.yaw_rad,
+            n_m=pose.n_m,
+            e_m=pose.e_m,
+            roll_rad=pose.roll_rad,
+            pitch_rad=pose.pitch_rad,
+            focal_px=self._camera.focal_px,
+        )
 
     def _note_sights(self, sighting: Sighting, pose: Pose, fleet_utime: int) -> dict[int, float]:
         """Write our own sights into the map; lean our correction towards what the neighbours see."""

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.cameras.pinhole import Pose
+from procs.registrar.map import AxisState, MapAnimal
 
 __all__ = ["Correction", "MapBook", "MapEntry", "UpkeepError"]
 
@@ -74,6 +75,11 @@ class MapEntry:
     misses: int = 0
     theirs_m: Array | None = None  # the newest sight by another drone
     theirs_fleet_utime: int = 0
+
+    def unturned(self) -> MapAnimal:
+        """As an animal of the map without an axis: it turned since the episode, nobody knows how."""
+        n_m, e_m = (float(x) for x in self.position_m)
+        return MapAnimal(n_m, e_m, self.size_m, 0.0, self.hits, 0, self.animal, AxisState.UNKNOWN)
 
 
 class MapBook:
