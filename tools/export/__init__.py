@@ -1,0 +1,1 @@
+"""Recorded logs in the formats of other programs: maps, tables, Foxglove, Rerun."""
