@@ -45,8 +45,11 @@ def idle(now: Situation, memory: Memory, camera: Pinhole) -> Step:
     vehicle = now.inputs.vehicle
     if memory.reason in (WAITS, BATTERY_UNKNOWN) and now.told:
         memory.reason = BATTERY_UNKNOWN if now.battery is None else WAITS
-    order_us = now.inputs.fleet.order.utime if now.inputs.fleet is not None else 0
-    ordered = now.command == podwatch.operator_t.START and order_us > memory.start_order_us
+    fleet = now.inputs.fleet
+    order_us = fleet.order.utime if fleet is not None else 0
+    # Not by an order of before it landed, which may still be in force: people stand beside it by now.
+    is_new = order_us > memory.start_order_us and order_us - now.fleet_offset_us > memory.landed_us
+    ordered = now.command == podwatch.operator_t.START and is_new
     wanted = ordered or (now.mission.search.start == "auto" and memory.state == State.IDLE)
     blocked = (podwatch.operator_t.HOLD, podwatch.operator_t.RETURN, podwatch.operator_t.LAND)
     if not wanted or now.command in blocked or now.in_state_s < LISTEN_S or vehicle is None:

@@ -159,6 +159,8 @@ class Navigator:
             memory.lost_animal = -1
         elif target in (State.RETURN, State.LAND, State.LANDED):
             memory.find, memory.animal, memory.surplus = None, -1, False
+        if target == State.LANDED:
+            memory.landed_us = inputs.utime
         memory.state, memory.since_us, memory.reason = target, inputs.utime, event.value
 
     def _clear(self, now: Situation, velocity: Array) -> Array:

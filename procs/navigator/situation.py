@@ -126,6 +126,7 @@ class Memory:
     hold_ned: Array | None = None
     resume: Event = Event.TO_STANDBY
     start_order_us: int = 0  # utime of the START order that was already obeyed
+    landed_us: int = 0  # when it came to be LANDED, or was found so at its start; 0 before
 
 
 def episode_key(message: podwatch.identities_t | podwatch.assignment_t | None) -> EpisodeKey:
@@ -283,6 +284,11 @@ class Situation:
         roster = self.mission.roster
         heights = layer_heights(len(roster), lowest_m, self.mission.limits.max_height_m - 1.0, most=most)
         return float(heights[roster.index(self.drone_id)])
+
+    @property
+    def fleet_offset_us(self) -> int:
+        """Fleet time is the drone's clock plus this."""
+        return int(self.inputs.fleet.fleet_offset_us) if self.inputs.fleet is not None else 0
 
     @property
     def command(self) -> int:

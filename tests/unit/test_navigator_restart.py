@@ -182,3 +182,17 @@ def test_a_landed_drone_stays_so_on_the_ground_and_without_a_word_of_the_autopil
     navigator = landed()
     navigator.update(flying_low(101 * S, **members))
     assert navigator.state == State.LANDED
+
+
+@pytest.mark.parametrize(("given_s", "offset_s", "state"), [(99, 0, State.LANDED), (99, -5, State.TAKEOFF)])
+def test_a_start_order_of_before_it_was_found_landed_does_not_take_it_off_again(given_s, offset_s, state):
+    """The order is still in force, and the restarted navigator does not know that it was obeyed already."""
+    navigator = landed()
+    for tick in range(40):
+        inputs = flying_low(100 * S + tick * S // 10, d_m=0.0, armed=False, landed=True)
+        inputs.fleet.fleet_offset_us = offset_s * S
+        inputs.fleet.order = make(
+            podwatch.operator_t, utime=given_s * S, command=podwatch.operator_t.START, expiry_s=600
+        )
+        navigator.update(inputs)
+    assert navigator.state == state

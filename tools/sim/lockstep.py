@@ -21,6 +21,7 @@ from lcmtypes.podwatch import world_state_t
 from procs import processes
 from procs.detector.yolo import Detector
 from procs.queue_executor import EventQueue, QueueRuntime, VirtualBus
+from procs.relay.members import BOAT_ID
 from procs.settings import DroneSettings
 from procs.tracker.mask_tracker import MaskTracker
 from tools.sim.plan import RunPlan
@@ -45,13 +46,13 @@ class LockstepFleet:
         seed = plan.mission.seed
         roster = plan.mission.roster
         self._cuts: dict[tuple[int, int], bool] = {}
-        self._ether = MemoryEther(
+        self.ether = MemoryEther(
             np.random.default_rng([seed, 5]),
             self._deliver_after,
             latency_s=plan.mission.world.radio_latency_s,
             loss=plan.mission.world.radio_loss,
         )
-        self._ether.blocked = lambda sender, receiver: self._cuts.get((sender, receiver), False)
+        self.ether.blocked = lambda sender, receiver: self._cuts.get((sender, receiver), False)
         pairs = {drone_id: link_pair(self._deliver, drone_id) for drone_id in roster}
         self.world = World(plan.world_settings(), {drone_id: pair[1] for drone_id, pair in pairs.items()})
         self._state = self.world.state()
@@ -125,7 +126,8 @@ class LockstepFleet:
             "detector": lambda _process: BoxDetector(seed) if boxes else Detector(),
             "tracker": lambda _process: BoxTracker(seed) if boxes else MaskTracker(),
             "autopilot": lambda _process: link,
-            "radio": lambda _process: self._ether.radio(drone_id, self.plan.mission.roster),
+            # The boat has a radio too, where somebody sails one.
+            "radio": lambda _process: self.ether.radio(drone_id, (BOAT_ID, *self.plan.mission.roster)),
         }
 
     def _look(self) -> tuple[world_state_t, float, float]:
