@@ -90,6 +90,24 @@ def train_detector(
         command(out, data, Settings.steps if steps is None else steps, seed, smoke)
 
 
+@train.command("assigner")
+def train_assigner(
+    out: Annotated[Path, typer.Option(help="Folder for checkpoints and weights.")] = Path("runs/assigner"),
+    loss: Annotated[str, typer.Option(help="ours, or paper: the paper's own network and loss.")] = "ours",
+    steps: Annotated[int | None, typer.Option(min=1)] = None,
+    seed: Annotated[int, typer.Option(min=0)] = 0,
+    smoke: Annotated[bool, typer.Option("--smoke", help="A few steps, export and check only.")] = False,
+) -> None:
+    """Train the assigner's network, export it for numpy and measure it."""
+    with wanted_extra("train"):
+        from tools import train_assigner, train_assigner_paper
+    with plain_errors():
+        if loss not in ("ours", "paper"):
+            raise ValueError(f"loss {loss!r} is not known; there are: ours, paper")
+        trainer = train_assigner if loss == "ours" else train_assigner_paper
+        trainer.command(out, seed, steps, smoke)
+
+
 def main() -> None:
     """The entry point of the `podwatch` script."""
     app()

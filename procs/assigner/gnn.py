@@ -42,22 +42,28 @@ class GnnAgent:
         if not 1 <= rounds <= MOST_ROUNDS:
             raise ValueError(f"rounds {rounds}: the learned methods take 1 to {MOST_ROUNDS}")
         self.index, self.n_agents, self.rounds = index, n_agents, rounds if n_agents > 1 else 0
-        self._codes: list[Codes] = [cost_codes(np.asarray(own_costs, dtype=np.float64))]
+        self._codes: list[Codes] = []  # the window's rows as they travel,
+        self._costs: list[Floats] = []  # and the costs that they stand for
+        self._held: list[bool] = []
+        self._keep(cost_codes(np.asarray(own_costs, dtype=np.float64)))
         self.n_goals = len(self._codes[0])
-        self._held = [True]
         self._network = weights or network()
         self._number = 0
         self._last = ({0: 0}, {0: 0})  # hops -> place of the row in the window, to the left and to the right
         self._prices = np.zeros(self.n_goals + (n_agents > self.n_goals))
-        self.logits = np.zeros(0)  # (g,) how much each goal is wanted by now
         self._state = self._seen = np.zeros(0)
         self._allowed = np.zeros(0, dtype=bool)
         self._started = False
 
     @property
+    def logits(self) -> Floats:
+        """(g,) how much it wants each goal by now, -inf what it must not take; the last may be for none."""
+        return self._network.logits(self._state, self._seen, self._allowed)
+
+    @property
     def goal(self) -> int:
         """The column that it wants most once all rounds are over, -1 for none, and before that."""
-        if self._number < self.rounds or not self._started or not np.isfinite(self.logits).any():
+        if self._number < self.rounds or not self._started or not self._allowed.any():
             return NONE
         best = int(self.logits.argmax())
         return best if best < self.n_goals else NONE
@@ -75,17 +81,22 @@ class GnnAgent:
         elif self._number < self.rounds:
             self._number += 1
             self._listen(inbox)
-        self.logits = self._network.logits(self._state, self._seen, self._allowed)
         return self._say() if self._number < self.rounds else []
 
     def _look(self) -> Floats:
         """What the network sees of the rows held by now."""
-        rows = code_costs(np.array(self._codes))
-        window = observe(rows, np.array(self._held), self.n_agents)
+        window = observe(np.array(self._costs), np.array(self._held), self.n_agents)
         self._prices, bids = bid(window, self._prices, temperature(self._number))
         self._allowed = window.allowed[0]
         self._seen = features(window, self._prices, bids, self.n_agents)
         return self._seen
+
+    def _keep(self, row: Codes | None) -> None:
+        """Add a row to the window, or None for one that did not come."""
+        codes = row if row is not None else np.zeros(self.n_goals, dtype=np.uint16)
+        self._codes.append(codes)
+        self._costs.append(code_costs(codes))
+        self._held.append(row is not None)
 
     def _listen(self, inbox: list[bytes]) -> None:
         relaying = self._number <= self.n_agents // 2
@@ -98,8 +109,7 @@ class GnnAgent:
                 heard[:, 2 * SLOTS + side] = 1.0
             if relaying and not (side == 1 and 2 * self._number == self.n_agents):
                 self._last[side][self._number] = len(self._codes)
-                self._codes.append(row if row is not None else np.zeros(self.n_goals, dtype=np.uint16))
-                self._held.append(row is not None)
+                self._keep(row)
         given = np.concatenate([self._look(), heard], axis=-1)
         self._state = self._network.round(self._number, self.rounds, self._state, given)
 

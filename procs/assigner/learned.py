@@ -6,13 +6,15 @@ leading axes: an agent passes (g, STATE), the evaluator (B, n, g, STATE).
 
 from dataclasses import dataclass
 from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 import models
+from procs.assigner.window import FEATURES
 
-__all__ = ["SLOTS", "STATE", "TRAINING_SEEDS", "Network", "block_of", "network"]
+__all__ = ["SLOTS", "STATE", "TRAINING_SEEDS", "Network", "block_of", "load", "network"]
 
 Floats = NDArray[np.float64]
 
@@ -70,11 +72,25 @@ def block_of(number: int, n_rounds: int) -> int:
     return 4 if number == n_rounds else 3
 
 
+def load(path: Path) -> Network:
+    """The network that tools/train_assigner.py wrote to this file.
+
+    Raises ValueError for a file that holds anything else.
+    """
+    with np.load(path) as file:
+        found = Network({name: np.asarray(file[name], dtype=np.float64) for name in file.files})
+    shape = found.weights.get("start.weight", np.zeros(0)).shape
+    if shape != (FEATURES, STATE):
+        raise ValueError(f"{path}: start.weight has shape {shape}, not {(FEATURES, STATE)}; train it again")
+    return found
+
+
 @lru_cache(maxsize=8)
 def network(training_seed: int = 0) -> Network:
-    """The network that ships for this training seed (0, 1 or 2; 0 flies).
+    """The network that ships for this training seed (0, 1 or 2; 0 is the default).
 
-    Raises FileNotFoundError where there is none.
+    Raises ValueError where none ships.
     """
-    with np.load(models.path(f"assigner_{training_seed}.npz")) as file:
-        return Network({name: np.asarray(file[name], dtype=np.float64) for name in file.files})
+    if training_seed not in TRAINING_SEEDS:
+        raise ValueError(f"training seed {training_seed}: networks ship for {TRAINING_SEEDS}")
+    return load(models.path(f"assigner_{training_seed}.npz"))

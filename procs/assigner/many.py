@@ -56,16 +56,14 @@ def _flood_tables(arrived: Bools, n: int, n_goals: int) -> tuple[Bools, Ints]:
     known = [np.zeros_like(held), np.zeros_like(held)]  # what the left, the right neighbour said it holds
     sent = np.zeros((count, n), dtype=np.int64)
     for number in range(arrived.shape[1]):
-        done = [bitmap.all(axis=2) for bitmap in known]
-        for side in range(1 if n == 2 else 2):
-            rows = np.where(done[side], 0, held.sum(axis=2))
-            sent += COPIES * (1 + 2 * ((n + 7) // 8) + rows * 2 * n_goals)
+        lacking = [held & ~bitmap for bitmap in known]
+        for rows in lacking[: 1 if n == 2 else 2]:
+            sent += COPIES * (1 + 2 * ((n + 7) // 8) + rows.sum(axis=2) * 2 * n_goals)
         before = held.copy()
         for side, shift in enumerate((1, -1)):
             came = arrived[:, number, 0 if n == 2 else side][..., None]
-            told = np.roll(before, shift, axis=1) & came
-            known[side] |= told
-            held |= told & ~np.roll(done[1 - side], shift, axis=1)[..., None]
+            known[side] |= np.roll(before, shift, axis=1) & came
+            held |= np.roll(lacking[1 - side], shift, axis=1) & came
     return held, sent
 
 

@@ -21,6 +21,8 @@ ITERATIONS = 5  # price updates a round: all that a round's 0.2 ms leave room fo
 RELAXATION = 1.8  # how far beyond Sinkhorn's own step prices move: 1 needs twice the updates, 3 swings
 # Softness of the bids at 0, 1, 2, ... rounds, in spreads of a row of costs; the last stays.
 TEMPERATURES = (0.5, 0.35, 0.22, 0.14, 0.09, 0.06)
+LEAST = 1e-9  # of an agent: a goal that is wanted less has no price
+TINY = 1e-290  # where a row is not held, or all in it forbidden
 FAR = 8.0  # spreads: what lies farther, or is forbidden, looks as far as this
 
 
@@ -69,18 +71,24 @@ def bid(window: Window, prices: Floats, softness: float) -> tuple[Floats, Floats
 
     Sinkhorn's scaling with columns that may stay empty: prices never fall below 0.
     """
-    price = prices / window.scale[..., None]
+    # In Sinkhorn's own form, as factors exp(-price / softness): a few small products an update.
+    lure = np.exp(window.costs / -softness) * window.allowed  # (..., W, g)
+    factor = np.exp(prices / (window.scale[..., None] * -softness))
     for _ in range(ITERATIONS):
-        wanted = _bids(window, price, softness).sum(axis=-2) / window.room
-        step = RELAXATION * softness * np.log(np.maximum(wanted, 1e-9))
-        price = np.clip(price + step, 0.0, FAR)
-    return price * window.scale[..., None], _bids(window, price, softness)
+        wanted = factor * _columns(lure, 1.0 / _rows(lure, factor)) / window.room
+        factor = factor * np.maximum(wanted, LEAST) ** -RELAXATION
+        factor = np.minimum(np.maximum(factor, np.exp(FAR / -softness)), 1.0)
+    price = np.log(factor) * -softness
+    bids = lure * factor[..., None, :] / _rows(lure, factor)[..., None]
+    return price * window.scale[..., None], bids
 
 
-def _bids(window: Window, price: Floats, softness: float) -> Floats:
-    net = (window.costs + price[..., None, :]) / -softness
-    bids = np.exp(net - net.max(axis=-1, keepdims=True)) * window.allowed
-    return np.asarray(bids / np.maximum(bids.sum(axis=-1, keepdims=True), 1e-9))
+def _rows(lure: Floats, factor: Floats) -> Floats:
+    return np.asarray(np.maximum((lure @ factor[..., None])[..., 0], TINY))
+
+
+def _columns(lure: Floats, weight: Floats) -> Floats:
+    return np.asarray((weight[..., None, :] @ lure)[..., 0, :])
 
 
 def features(window: Window, prices: Floats, bids: Floats, n_agents: int) -> Floats:
