@@ -12,6 +12,7 @@ import warnings
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
+from itertools import permutations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,7 @@ from rich.table import Table
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import cdist
 
-from procs.registrar._literal import PERMUTATIONS, corner_costs, corners_of
+from procs.registrar._literal import corner_costs, corners_of
 from tools.bench.registration_pairs import pair_counts
 from tools.bench.registration_scenes import Cell, draw_views, trial_rng, true_matches
 
@@ -30,6 +31,8 @@ Matches = set[tuple[int, int]]
 
 ROUNDS = 60  # of an ICP, or of the literal algorithm
 HEADINGS = 36
+SETTLED = 1e-4  # a round that lowers the cost by no more than this share is the last
+ORDERS = np.array(list(permutations(range(4))))  # (24, 4): a corner of the partner for each corner
 
 
 def _normalised(boxes: Array) -> tuple[Array, float]:
@@ -95,23 +98,30 @@ def _drift(source: Array, target: Array, apart: float, kind: str) -> Matches:
     return _assigned(moved, _centres(target), apart) if np.isfinite(moved).all() else set()
 
 
+def _best_corners(corners: Array, goals: Array) -> Array:
+    """(K, 4, 2) corners of K boxes and of their partners -> the partners' in the order that lies nearest."""
+    distances = np.linalg.norm(corners[:, :, None] - goals[:, None], axis=3)  # (K, 4, 4)
+    totals = distances[:, np.arange(4), ORDERS].sum(axis=2)  # (K, 24)
+    return np.take_along_axis(goals, ORDERS[totals.argmin(axis=1)][:, :, None], axis=1)
+
+
 def _literal_from(corners: Array, goals: Array) -> tuple[float, Matches]:
     """The paper's algorithm on (N, 4, 2) corners, from where they are -> its last cost and matches."""
-    previous = None
+    previous: list[int] = []
+    total = np.inf
     for _ in range(ROUNDS):
-        costs, best = corner_costs(corners, goals)
+        costs = corner_costs(corners, goals)[0]
         rows, columns = linear_sum_assignment(costs)
-        state = (columns.tolist(), best[rows, columns].tolist())
-        if state == previous:
+        is_settled = columns.tolist() == previous and costs[rows, columns].sum() > total * (1 - SETTLED)
+        previous, total = columns.tolist(), float(costs[rows, columns].sum())
+        if is_settled:
             break
-        previous = state
         points = corners[rows].reshape(-1, 2)
-        order = PERMUTATIONS[best[rows, columns]][:, :, None]
-        wanted = np.take_along_axis(goals[columns], order, axis=1).reshape(-1, 2)
+        wanted = _best_corners(corners[rows], goals[columns]).reshape(-1, 2)
         design = np.column_stack([points, np.ones(len(points))])
         step = np.linalg.lstsq(design, wanted, rcond=None)[0]
         corners = corners @ step[:2] + step[2]
-    return float(costs[rows, columns].sum()), set(zip(rows.tolist(), columns.tolist(), strict=True))
+    return total, set(zip(rows.tolist(), columns.tolist(), strict=True))
 
 
 def _literal_36(source: Array, target: Array, apart: float) -> Matches:
