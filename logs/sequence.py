@@ -1,6 +1,7 @@
 """Gaps in `seq`: how many messages never arrived, told from the head that every message begins with."""
 
 import struct
+from functools import lru_cache
 from typing import NamedTuple
 
 from lcmtypes import channels, podwatch
@@ -25,10 +26,15 @@ class Head(NamedTuple):
 
 def read_head(channel: str, data: bytes) -> Head | None:
     """The head of a message, None where the table has no such channel or the bytes are of another type."""
-    kind = channels.kind_of(channel)
-    if kind is None or len(data) < HEAD.size or data[:8] != fingerprint(kind):
+    if len(data) < HEAD.size or data[:8] != _fingerprint_of(channel):
         return None
     return Head._make(HEAD.unpack_from(data))
+
+
+@lru_cache(maxsize=4096)  # asked for every message; names on a bus are few, or garbage
+def _fingerprint_of(channel: str) -> bytes | None:
+    kind = channels.kind_of(channel)
+    return fingerprint(kind) if kind else None
 
 
 class GapCounter:

@@ -67,3 +67,18 @@ def bench_assignment(
 
     with plain_errors():
         command(seed, out, quick=quick)
+
+
+@bench.command("logs")
+def bench_logs(
+    out: Annotated[Path, typer.Option(help="Folder for the table.")] = Path("runs/bench"),
+    seconds: Annotated[float, typer.Option(min=1, help="Length of each flood.")] = 10.0,
+    real_time: Annotated[
+        bool, typer.Option("--real-time", help="Measure before all else that the machine does (root).")
+    ] = False,
+) -> None:
+    """What the logger keeps of a flood beside lcm-logger, how fast logs are written, how late they play."""
+    from tools.bench.logs import command
+
+    with plain_errors():
+        command(out, seconds, real_time=real_time)

@@ -2,7 +2,7 @@
 
 import time
 from array import array
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -50,7 +50,7 @@ class Player:
 
     def __init__(
         self,
-        buses: dict[int, Bus],
+        buses: Mapping[int, Bus],
         selection: Selection,
         speed: float = 1.0,
         rings: dict[int, SharedFrames] | None = None,

@@ -62,6 +62,8 @@ def sim(
     console = Console()
     fallback = "" if lockstep or has_multicast_route() else NO_ROUTE
     with plain_errors():
+        if log_frames and sensor == "boxes":
+            raise MissionError("--log-frames: --sensor boxes looks at no pixels; drop one of them")
         chosen = with_overrides(read_mission(mission), drones, animals, seed, duration, log_frames=log_frames)
         addresses = _addresses(autopilot, chosen, lockstep, fallback)
         plan = _plan(chosen, out, sensor, scene, addresses)
