@@ -7,7 +7,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from procs.assigner.learned import SLOTS, STATE, block_of
-from procs.assigner.window import FEATURES
+from procs.assigner.window import FEATURES, hops_relayed
 
 __all__ = ["RingNetwork"]
 
@@ -60,7 +60,7 @@ class RingNetwork(nn.Module):
             if n == 2:
                 right = left  # the one neighbour stands on both sides and is told once
             arrived = delivered[number - 1]
-            if number <= n // 2:  # the first slot carries a row of costs
+            if number <= hops_relayed(n):  # the first slot carries a row of costs
                 left, right = (functional.pad(side[..., 1:], (1, 0)) for side in (left, right))
             heard = [side * came[..., None, None] for side, came in zip((left, right), arrived, strict=True)]
             came = arrived.permute(1, 2, 0)[:, :, None].expand(batch, n, g, 2)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from procs.assigner.costs import FORBIDDEN, NONE, UNIT, code_values, cost_codes
 from procs.assigner.learned import SLOTS, Network, network
-from procs.assigner.window import bid, features, observe, temperature
+from procs.assigner.window import bid, features, hops_relayed, observe, temperature
 
 __all__ = ["MOST_ROUNDS", "GnnAgent", "code_costs"]
 
@@ -99,7 +99,7 @@ class GnnAgent:
         self._held.append(row is not None)
 
     def _listen(self, inbox: list[bytes]) -> None:
-        relaying = self._number <= self.n_agents // 2
+        relaying = self._number <= hops_relayed(self.n_agents)
         size = len(self._prices)
         heard = np.zeros((size, 2 * SLOTS + 2))
         for side in range(2):
@@ -132,7 +132,7 @@ class GnnAgent:
 
     def _say(self) -> list[bytes]:
         number = self._number + 1
-        relaying = number <= self.n_agents // 2
+        relaying = number <= hops_relayed(self.n_agents)
         said = self._network.say(self._number, self.rounds, self._state)
         messages = []
         for side in range(2):  # to the left, to the right

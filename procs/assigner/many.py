@@ -13,6 +13,7 @@ from procs.assigner.gnn import code_costs
 from procs.assigner.learned import SLOTS, Network
 from procs.assigner.resolve import Lists, choose, left_over, split_rounds, wanted_goals
 from procs.assigner.ring_rows import Seen, seen_by_round
+from procs.assigner.window import hops_relayed
 
 __all__ = ["Assignments", "exact_rings", "gnn_rings", "resolve_rings"]
 
@@ -109,7 +110,7 @@ def _learn_some(rows: Floats, rounds: int, delivered: Bools, weights: Network) -
         if number == 0:
             state = weights.start(seen.features)
         else:
-            heard = _heard(said, delivered[number - 1], relaying=number <= n // 2)
+            heard = _heard(said, delivered[number - 1], relaying=number <= hops_relayed(n))
             state = weights.round(number, rounds, state, np.concatenate([seen.features, heard], axis=-1))
         if number < rounds:
             said = weights.say(number, rounds, state)
@@ -122,7 +123,7 @@ def _learn_some(rows: Floats, rounds: int, delivered: Bools, weights: Network) -
 def _bytes_said(number: int, seen: Seen, n_goals: int) -> Ints:
     """(B, n) bytes that each agent sends in round `number`, to both sides."""
     n, g = seen.allowed.shape[1:]
-    relaying = number <= n // 2
+    relaying = number <= hops_relayed(n)
     numbers = 2 + 2 * (SLOTS - relaying) * g
     to_right = numbers + 2 * n_goals * (seen.to_hand_on[0] & relaying)
     if n == 2:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from procs.assigner.window import bid, features, observe, temperature
+from procs.assigner.window import bid, features, hops_relayed, observe, temperature
 
 __all__ = ["Seen", "seen_by_round"]
 
@@ -33,7 +33,7 @@ def seen_by_round(rows: Floats, delivered: Bools) -> Iterator[Seen]:
     relayed = [held[..., 0], held[..., 0]]
     prices = None
     for number in range(len(delivered) + 1):
-        if 0 < number <= n // 2:
+        if 0 < number <= hops_relayed(n):
             for side, shift in enumerate((1, -1)):
                 if side == 1 and 2 * number == n:
                     break  # the agent opposite: one way is enough

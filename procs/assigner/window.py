@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["FEATURES", "Window", "bid", "features", "observe", "temperature"]
+__all__ = ["FEATURES", "Window", "bid", "features", "hops_relayed", "observe", "temperature"]
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -23,6 +23,7 @@ RELAXATION = 1.8  # how far beyond Sinkhorn's own step prices move: 1 needs twic
 TEMPERATURES = (0.5, 0.35, 0.22, 0.14, 0.09, 0.06)
 LEAST = 1e-9  # of an agent: a goal that is wanted less has no price
 TINY = 1e-290  # where a row is not held, or all in it forbidden
+MOST_HOPS = 8  # the widest window in training; farther rows would cost time and change little
 FAR = 8.0  # spreads: what lies farther, or is forbidden, looks as far as this
 
 
@@ -40,6 +41,11 @@ class Window(NamedTuple):
 def temperature(number: int) -> float:
     """Softness of the bids after `number` rounds."""
     return TEMPERATURES[min(number, len(TEMPERATURES) - 1)]
+
+
+def hops_relayed(n_agents: int) -> int:
+    """How many hops a row of costs is handed on, to each side."""
+    return min(n_agents // 2, MOST_HOPS)
 
 
 def observe(rows: Floats, held: Bools, n_agents: int) -> Window:
@@ -74,21 +80,13 @@ def bid(window: Window, prices: Floats, softness: float) -> tuple[Floats, Floats
     # In Sinkhorn's own form, as factors exp(-price / softness): a few small products an update.
     lure = np.exp(window.costs / -softness) * window.allowed  # (..., W, g)
     factor = np.exp(prices / (window.scale[..., None] * -softness))
+    least = np.exp(FAR / -softness)
     for _ in range(ITERATIONS):
-        wanted = factor * _columns(lure, 1.0 / _rows(lure, factor)) / window.room
-        factor = factor * np.maximum(wanted, LEAST) ** -RELAXATION
-        factor = np.minimum(np.maximum(factor, np.exp(FAR / -softness)), 1.0)
-    price = np.log(factor) * -softness
-    bids = lure * factor[..., None, :] / _rows(lure, factor)[..., None]
-    return price * window.scale[..., None], bids
-
-
-def _rows(lure: Floats, factor: Floats) -> Floats:
-    return np.asarray(np.maximum((lure @ factor[..., None])[..., 0], TINY))
-
-
-def _columns(lure: Floats, weight: Floats) -> Floats:
-    return np.asarray((weight[..., None, :] @ lure)[..., 0, :])
+        wanted = factor * np.vecmat(1.0 / np.maximum(np.matvec(lure, factor), TINY), lure)
+        factor = factor * np.maximum(wanted / window.room, LEAST) ** -RELAXATION
+        factor = np.minimum(np.maximum(factor, least), 1.0)
+    bids = lure * factor[..., None, :] / np.maximum(np.matvec(lure, factor), TINY)[..., None]
+    return np.log(factor) * window.scale[..., None] * -softness, bids
 
 
 def features(window: Window, prices: Floats, bids: Floats, n_agents: int) -> Floats:
