@@ -65,11 +65,11 @@ class Network:
 
 def block_of(number: int, n_rounds: int) -> int:
     """Which of the five rounds' weights serve round `number` (1 first) of n_rounds: the fourth again and
-    again where there are more, the fifth last.
+    again where there are more, the fifth last of five or more.
     """
     if number <= 3:
         return number - 1
-    return 4 if number == n_rounds else 3
+    return 4 if number == n_rounds >= 5 else 3
 
 
 def load(path: Path) -> Network:
