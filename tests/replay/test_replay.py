@@ -293,6 +293,16 @@ def test_messages_are_paired_by_their_time_within_the_tolerance():
     assert [one.at_us for one in account.differences] == [0, 3, 100, 190, 200]
 
 
+def test_of_two_messages_within_the_tolerance_the_nearest_is_the_pair():
+    """One message too many at the beginning must not shift all pairs by one."""
+    then = [track(k * 100, frame_seq=k) for k in range(1, 5)]
+    now = [track(k * 100 + 2, frame_seq=k) for k in range(5)]
+    [account] = compare(then, now, Tolerance(time_us=150))
+    assert (account.n_same, account.n_different, account.n_missing, account.n_extra) == (4, 0, 0, 1)
+    [account] = compare(now, then, Tolerance(time_us=150))
+    assert (account.n_same, account.n_different, account.n_missing, account.n_extra) == (4, 0, 1, 0)
+
+
 @pytest.mark.parametrize(("relative", "agrees"), [(0.0, False), (0.005, False), (0.02, True)])
 def test_numbers_may_differ_by_a_share(relative, agrees):
     [account] = compare([track(0, u_px=100.0)], [track(0, u_px=101.0)], Tolerance(relative=relative))

@@ -12,7 +12,8 @@ from tools.replaying.run import Said
 __all__ = ["Account", "Difference", "Tolerance", "compare"]
 
 # Counters and names that a new start draws anew; what the machine was doing at that time.
-NEVER_COMPARED = frozenset({"seq", "ring", "token", "pid", "cpu", "memory_mb", "late_ms"})
+NEVER_COMPARED = frozenset({"seq", "ring", "token", "pid", "cpu", "memory_mb", "late_ms", "compute_us"})
+NOT_IN_REAL_TIME = frozenset({"loop_hz", "rates_hz"})  # one message more or less in a second is no fault
 TIMES = ("_us", "utime")
 MS = "_ms"
 
@@ -26,6 +27,8 @@ class Tolerance:
 
     def agrees(self, name: str, recorded: Any, replayed: Any) -> bool:
         """Whether two values of the member `name` are the same."""
+        if self.time_us and name in NOT_IN_REAL_TIME:
+            return True
         if isinstance(recorded, str | bytes | bool):
             return bool(recorded == replayed)
         first, second = np.asarray(recorded), np.asarray(replayed)
@@ -102,19 +105,27 @@ def _compare_channel(name: str, then: list[Said], now: list[Said], tolerance: To
 
 
 def _pairs(then: list[Any], now: list[Any], tolerance: Tolerance) -> Iterator[tuple[Any, Any]]:
-    """(recorded, replayed) by utime; None for the one that has no counterpart."""
+    """(recorded, replayed) by utime, the nearest within the tolerance; None where there is no counterpart."""
     i = j = 0
     while i < len(then) or j < len(now):
-        if j == len(now):
-            ahead = -1
-        elif i == len(then):
-            ahead = 1
-        else:
-            apart_us = then[i][1].utime - now[j][1].utime
-            ahead = 0 if abs(apart_us) <= tolerance.time_us else (1 if apart_us > 0 else -1)
+        ahead = _ahead(then, now, i, j, tolerance.time_us)
         yield (then[i] if ahead <= 0 else None), (now[j] if ahead >= 0 else None)
         i += ahead <= 0
         j += ahead >= 0
+
+
+def _ahead(then: list[Any], now: list[Any], i: int, j: int, time_us: int) -> int:
+    """0 where then[i] and now[j] are a pair, -1 where then[i] stands alone, 1 where now[j] does."""
+    if j == len(now) or i == len(then):
+        return -1 if j == len(now) else 1
+    apart_us = abs(then[i][1].utime - now[j][1].utime)
+    if apart_us > time_us:
+        return 1 if then[i][1].utime > now[j][1].utime else -1
+    if j + 1 < len(now) and abs(then[i][1].utime - now[j + 1][1].utime) < apart_us:
+        return 1
+    if i + 1 < len(then) and abs(then[i + 1][1].utime - now[j][1].utime) < apart_us:
+        return -1
+    return 0
 
 
 def _differing(

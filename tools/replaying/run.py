@@ -152,8 +152,10 @@ class _Replay:
         for start_us in self._starts:
             self._queue.schedule(self._clock.true_us(start_us), self._start)
         self._feed_from(first, messages)
-        end_us = self._clock.utime(self._queue.now_us)
-        # What came before the log began, or after its end, has no counterpart.
+        # What came before the log began, or after the process ended, has no counterpart; it beat to its end.
+        end_us = self._recorded[-1].at_us
+        if not self._is_virtual:
+            begin_us = self._recorded[0].at_us
         replayed = [said for said in self._replayed if begin_us <= said.at_us <= end_us]
         return Replayed(self._recorded, replayed, self._is_virtual, len(self._starts))
 
