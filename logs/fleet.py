@@ -30,7 +30,7 @@ Report = Callable[[str], None]
 LEAST_SPAN_US = 20_000_000  # over less, a drift of some ppm drowns in the noise of the offsets
 OUTLIER = 4.0  # times the median residual; beyond it an offset is a slow datagram's
 MOST_SAMPLES = 2000  # of one link; more say nothing more
-FLEET_LOG = re.compile(r"drone_\d+\.mcap")
+FLEET_LOG = re.compile(r"(drone_\d+)(\.\d+)?\.mcap")  # the first file may have been dropped for room
 
 
 class FleetMessage(NamedTuple):
@@ -125,7 +125,8 @@ def find_logs(paths: Iterable[Path]) -> list[Path]:
         if not path.is_dir():
             found.append(path)
             continue
-        drones = sorted(file for file in path.glob("drone_*.mcap") if FLEET_LOG.fullmatch(file.name))
+        names = [FLEET_LOG.fullmatch(file.name) for file in path.glob("drone_*.mcap")]
+        drones = sorted(path / f"{stem}.mcap" for stem in {name[1] for name in names if name})
         if not drones:
             raise LogError(f"{path}: no drone_<id>.mcap in this folder; give a run's folder, or logs")
         found += drones

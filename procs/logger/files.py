@@ -116,15 +116,23 @@ class LogFiles:
         if not self._quota_bytes:
             return []
         pictures, logs = self._pictures.closed_files(), self._log.closed_files()
-        sizes = {path: path.stat().st_size for path in (*pictures, *logs)}
+        sizes = {path: _size(path) for path in (*pictures, *logs)}
         n_bytes = sum(sizes.values()) + self._log.n_bytes + self._pictures.n_bytes
         dropped = []
         for path in (*pictures, *logs):
             if n_bytes <= self._quota_bytes or (path in logs and self._pictures.n_bytes):
                 break
-            path.unlink()
+            path.unlink(missing_ok=True)
             n_bytes -= sizes[path]
             dropped.append(path)
         if n_bytes > self._quota_bytes:
             (self._pictures if self._pictures.n_bytes else self._log).close()
         return dropped
+
+
+def _size(path: Path) -> int:
+    """Bytes of a file; 0 where somebody took it away meanwhile."""
+    try:
+        return path.stat().st_size
+    except FileNotFoundError:
+        return 0

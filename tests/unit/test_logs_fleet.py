@@ -137,3 +137,11 @@ def test_what_a_drones_logger_left_beside_its_log_belongs_to_it(tmp_path):
 def test_a_folder_without_logs_is_told(tmp_path):
     with pytest.raises(LogError, match=r"no drone_<id>\.mcap in this folder"):
         find_logs([tmp_path])
+
+
+def test_a_log_whose_first_file_was_dropped_is_found(tmp_path):
+    write_log(tmp_path, 1, 0).rename(tmp_path / "drone_1.3.mcap")
+    write_log(tmp_path, 1, 0).rename(tmp_path / "drone_1.pictures.mcap")
+    assert find_logs([tmp_path]) == [tmp_path / "drone_1.mcap"]
+    log = DroneLog(tmp_path / "drone_1.mcap", ignore)
+    assert [path.name for path in log.paths] == ["drone_1.3.mcap", "drone_1.pictures.mcap"]

@@ -9,7 +9,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from logs.exceptions import LogError
-from logs.reader import LogInfo, info, read, segments
+from logs.reader import LogInfo, info, pictures, read, segments
 from logs.schemas import PACKAGE
 from tools.log.shared import LogPath, app, clear_errors, size_text, warn
 
@@ -91,9 +91,12 @@ def _summary(log: LogInfo) -> str:
         f"{'closed' if log.closed else 'NOT closed'}",
         f"drone clock {log.start_ns / 1e9:.6f} s to {log.end_ns / 1e9:.6f} s",
     ]
-    others = [str(segment) for segment in segments(log.path)[1:]]
+    others = [str(segment) for segment in segments(log.path) if segment != log.path]
     if others:
-        lines.append(f"the logger was restarted; the log goes on in {', '.join(others)}")
+        lines.append(f"the log goes on in {', '.join(others)}")
+    apart = [str(path) for path in pictures(log.path)]
+    if apart:
+        lines.append(f"its pictures are in {', '.join(apart)}")
     return "\n".join(lines)
 
 
