@@ -17,6 +17,8 @@ __all__ = ["Marks", "check_boxes", "ellipse_shapes", "marks_from_boxes", "rectan
 Array = NDArray[np.float64]
 
 BODY_WIDTH = 0.22  # width over length of the animal taken for an ellipse; whales lie between 0.18 and 0.3
+NEARLY_SQUARE, LIES_ACROSS = 0.6, 0.35  # short over long side, and the share of long bodies' boxes above it
+ROUND_BODIES = 0.05  # chance beforehand that a pod's boxes tell no axis
 DETECTION_PRICE = (
     2.4  # nats, ln(0.92 / 0.08): a box that should have a partner in the other view and has none
 )
@@ -29,7 +31,7 @@ class Marks:
     `centres` (N, 2); `shapes` (N, 2, 2, 2), two candidates of the matrix whose diagonal is the box's
     squared width and height; `prices` (N,) nats, the price of a mark without a partner although it lies in
     the other's `window`; `window` (M, 2), the convex outline of what the view covers, or None where nobody
-    said; `axis_known` (N,) 0 or 1, 0 where the shapes say nothing of the axis (None: all known).
+    said; `axis_known` (N,) 0 to 1, 0 where the shapes say nothing of the axis (None: all known).
     """
 
     centres: Array
@@ -114,4 +116,15 @@ def marks_from_boxes(boxes: Array, image_size: tuple[float, float] | None) -> Ma
     for candidate, sign in enumerate((1.0, -1.0)):
         shapes[:, candidate, 0, 1] = shapes[:, candidate, 1, 0] = sign * cross
     window = None if image_size is None else rectangle(float(image_size[0]), float(image_size[1]))
-    return Marks(centres, shapes, np.full(len(boxes), DETECTION_PRICE), window)
+    known = np.full(len(boxes), _longness(sides))
+    return Marks(centres, shapes, np.full(len(boxes), DETECTION_PRICE), window, known)
+
+
+def _longness(sides: Array) -> float:
+    """(N, 2) box sides -> the chance that the bodies are long. Round ones make every box nearly square,
+    long ones only where all of them happen to lie across.
+    """
+    if not len(sides) or (sides.min(axis=1) / sides.max(axis=1)).min() < NEARLY_SQUARE:
+        return 1.0
+    long = (1 - ROUND_BODIES) * LIES_ACROSS ** len(sides)
+    return float(long / (long + ROUND_BODIES))

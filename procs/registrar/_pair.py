@@ -16,6 +16,7 @@ Array = NDArray[np.float64]
 
 SIZE_SIGMA = 0.11  # of ln(size ratio): 5 % edge jitter in both views and what the ellipse leaves out
 SIZE_SPREAD = 0.27  # of ln(size ratio) between two different animals of a pod of 7 to 13 m
+SIZE_FLOOR = -6.0  # nats: the most that a size says against a match
 AXIS_SIGMA = 0.22  # rad of the doubled axis angle between two sights of one animal
 AXIS_OUTLIER = (
     0.06  # share of boxes whose proportions mislead: a turned fluke, a splash, another animal's back
@@ -47,7 +48,9 @@ def size_log_ratio(apart: Array) -> Array:
     """Differences of ln size, any shape -> log-likelihood ratio of one animal against two, same shape."""
     apart2 = apart * apart
     far = np.minimum(apart2, 0.4) / (2 * SIZE_SPREAD**2)
-    return np.asarray(np.maximum(np.log(SIZE_SPREAD / SIZE_SIGMA) - apart2 / (2 * SIZE_SIGMA**2) + far, -6.0))
+    return np.asarray(
+        np.maximum(np.log(SIZE_SPREAD / SIZE_SIGMA) - apart2 / (2 * SIZE_SIGMA**2) + far, SIZE_FLOOR)
+    )
 
 
 @dataclass(frozen=True)
@@ -194,11 +197,15 @@ def _normaliser(unit: float, origin: Array) -> Array:
 
 
 def _window(marks: Marks) -> Array:
-    """The marks' window, or the rectangle round them where nobody gave one."""
+    """The marks' window, or the upright square about them where nobody gave one: few boxes may lie in a row,
+    but no camera sees a strip."""
     if marks.window is not None:
         return marks.window
-    low, high = marks.centres.min(axis=0) - 0.3, marks.centres.max(axis=0) + 0.3
-    return np.array([[low[0], low[1]], [high[0], low[1]], [high[0], high[1]], [low[0], high[1]]])
+    low, high = marks.centres.min(axis=0), marks.centres.max(axis=0)
+    half = float((high - low).max()) / 2 + 0.3
+    return np.asarray(
+        (low + high) / 2 + half * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+    )
 
 
 def _polygon_area(corners: Array) -> float:

@@ -261,14 +261,19 @@ class RingNode:
         before, was_fused = self._sight, self._fused
         if not {*before.ids.values()} <= {one.id for one in animals}:
             before = Sight()  # taken for lost and passed over: this map does not hold the earlier word
-        sight, is_told = self._observer.look(header, animals)
-        if header.lap == 1 and animals and sight.confidence < FUSE_CONFIDENCE:
-            return header, animals
-        animals = without_sight(animals, before, len(self.members))
+        remembered = [one.id for one in self.memory.animals]
+        said_by_all, animals = animals, without_sight(animals, before, len(self.members))
+        # Only what others say: a drone that lay wrong once would find its own wrong animals again.
+        others = [one for one in animals if one.hits or one.id in remembered]
+        if before.ids and not others:
+            sight, is_told = replace(before, ids={}, missed=[], confidence=1.0), True
+        else:
+            sight, is_told = self._observer.look(header, others)
+        if header.lap == 1 and others and sight.confidence < FUSE_CONFIDENCE:
+            return header, said_by_all
         by_id = with_sight(header, animals, self._observer.marks, sight, before)
         self._add_new(header, by_id, sight, before, now_s, is_first_view=False)
         taken_back = [number for number in before.ids.values() if not by_id[number].hits]
-        remembered = [one.id for one in self.memory.animals]
         animals = [one for one in by_id.values() if one.id not in taken_back or one.id in remembered]
         self._sight, self._fused = sight, True
         flags = header.flags
