@@ -10,7 +10,7 @@ from scipy.optimize import linear_sum_assignment
 
 from procs.registrar._literal import corner_costs, corners_of
 from procs.registrar.box_icp import box_icp
-from tools.bench.registration import PAIRS, pair_success
+from tools.bench.registration import PAIRS, draw_views, pair_success
 
 
 @settings(deadline=None, max_examples=25)
@@ -47,6 +47,18 @@ def test_corners_are_carried_and_never_boxed_again():
     target = np.array([[-half, -half, half, half]])
     alignment = box_icp(source, target, mode="literal")
     np.testing.assert_allclose(alignment.transform[:2, :2], np.eye(2) * np.sqrt(2), atol=1e-6)
+
+
+def test_the_order_of_the_boxes_orders_the_answer():
+    near = next(cell for cell in PAIRS if cell.literal)
+    rng = np.random.default_rng(4)
+    source, target = draw_views(near, rng)
+    order = rng.permutation(len(source.boxes))
+    plain = box_icp(source.boxes, target.boxes, mode="literal")
+    mixed = box_icp(source.boxes[order], target.boxes, mode="literal")
+    assert sorted((int(order[a]), int(b)) for a, b in mixed.matches) == sorted(
+        map(tuple, plain.matches.tolist())
+    )
 
 
 def test_far_headings_defeat_it_and_near_ones_do_not():

@@ -1,6 +1,8 @@
 """The ring: one id for one animal in every view, whatever the links do, and consensus only where it is
 earned."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -113,6 +115,29 @@ def test_one_wrong_edge_is_no_consensus():
     fly(nodes, ring_links(4))
     assert calls
     assert not any(node.result.consensus for node in nodes)
+
+
+@pytest.mark.parametrize("wrong_row", [1, 2, 3])
+def test_an_edge_that_was_wrong_in_the_first_lap_is_repaired(wrong_row):
+    views = views_of(5, 4, seed=2)
+    calls = []
+
+    def wrong_once(source, target, *, prior=None):
+        """One match of five, said with full confidence, so that four animals are put where none are."""
+        found = align_marks(source, target, prior=prior)
+        if np.allclose(source.centres[0], wrong_once.centre):
+            calls.append(1)
+            if len(calls) == 1:
+                away = found.transform @ np.array([[1, 0, 40.0], [0, 1, -30.0], [0, 0, 1]])
+                return replace(found, matches=found.matches[:1], transform=away, confidence=0.99)
+        return found
+
+    nodes = nodes_of(views, register=wrong_once)
+    wrong_once.centre = nodes[wrong_row]._observer.marks.centres[0]
+    fly(nodes, ring_links(4))
+    assert len(calls) > 1
+    assert is_ring_right(views, Answers(nodes))
+    assert all(node.result.repaired and node.result.consensus for node in nodes)
 
 
 def test_views_of_another_pod_are_no_consensus():
