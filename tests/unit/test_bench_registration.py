@@ -28,15 +28,19 @@ from tools.bench.registration_scenes import (
     MEAN_LENGTH_M,
     Cell,
     View,
+    detected,
     draw_centres,
+    draw_pod,
     draw_views,
     inside_image,
     trial_rng,
+    true_boxes,
     true_matches,
 )
 from tools.bench.registration_speed import printed_costs
 from tools.cli import app
 from tools.detector_data import Sample
+from tools.detector_eval import box_iou
 
 DEG = np.pi / 180
 CLEAN = Cell("clean", 9, jitter=0.0, full_view=True)
@@ -159,6 +163,17 @@ def test_misses_false_alarms_and_jitter_are_as_frequent_as_the_cell_says():
         true, seen_boxes = one.boxes[np.argsort(one.animals)], other.boxes[np.argsort(other.animals)]
         errors.append((seen_boxes - true) / np.tile(true[:, 2:] - true[:, :2], 2))
     assert np.std(np.concatenate(errors)) == pytest.approx(0.05, rel=0.1)
+
+
+def test_a_false_alarm_is_on_no_animal():
+    cell, low = Cell("f", 12, false=1.0, jitter=0.0), Pose(0.0, 0.0, -40.0)
+    for trial in range(40):
+        rng = trial_rng(5, "f", trial)
+        everything = true_boxes(*draw_pod(12, rng), CAMERA.ground_to_image(low))
+        view = detected(everything, low, cell, rng)
+        false = view.boxes[view.animals < 0].astype(np.float32)
+        assert len(false) == 12
+        assert box_iou(false, everything.astype(np.float32)).max() < 0.451
 
 
 @pytest.mark.parametrize("n", [3, 5, 9, 20])

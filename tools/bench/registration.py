@@ -16,7 +16,7 @@ from tools.bench.registration_monitor import monitor_counts
 from tools.bench.registration_pairs import pair_counts, pair_success
 from tools.bench.registration_peers import METHODS, peer_counts, peer_key, peer_table
 from tools.bench.registration_rings import episode_counts, is_ring_right, ring_counts, ring_success
-from tools.bench.registration_scenes import CAMERA, IMAGE_SIZE, Cell, View, draw_views
+from tools.bench.registration_scenes import CAMERA, IMAGE_SIZE, Cell, View, draw_views, true_matches
 from tools.bench.registration_speed import speed_rows
 from tools.bench.registration_tasks import Task, count_all, in_chunks, rows_of_part, together
 from tools.bench.table import Row, print_table, write_table
@@ -33,6 +33,7 @@ __all__ = [
     "is_ring_right",
     "pair_success",
     "ring_success",
+    "true_matches",
 ]
 
 MOST_PEER_PAIRS = 100
