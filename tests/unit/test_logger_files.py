@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from drivers.frames import MemoryFrames
 from lcmtypes import channels, make, podwatch
@@ -12,6 +13,8 @@ from procs.logger import process as logger_process
 from procs.logger.files import LogFiles, SegmentedLog
 from procs.queue_executor import ClockError, EventQueue, QueueRuntime, VirtualBus
 from procs.settings import DroneSettings, LogSettings, Mission
+from tools.cli import app
+from tools.sim.command import read_mission, with_overrides
 
 SECOND_US = 1_000_000
 
@@ -171,3 +174,16 @@ def test_whole_frames_are_kept_and_a_lost_one_is_told(tmp_path):
     assert [image.frame_seq for image in images] == [0, 1, 2, 3, 4, 5, 6, 8, 9, 10, 11, 12, 13, 14]
     assert [set(image.data) for image in images[:3]] == [{0}, {1}, {2}]
     assert "1 frames were gone before they were logged" in beats[-1].detail
+
+
+def test_the_command_line_asks_for_whole_frames():
+    assert with_overrides(read_mission("default"), log_frames=True).log.frames
+    assert not with_overrides(read_mission("default")).log.frames
+
+
+def test_whole_frames_of_a_flight_without_pixels_are_refused(tmp_path):
+    arguments = ["sim", "--log-frames", "--sensor", "boxes", "--out", str(tmp_path / "runs")]
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code == 2
+    assert "--log-frames: --sensor boxes looks at no pixels; drop one of them" in result.stderr
+    assert not (tmp_path / "runs").exists()

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import rerun as rr
+import rerun.blueprint as rrb
 
 from tools.export.scenes import AnimalSight, DronePose, Marks, Note, Outline, Picture, Recording, colour_of
 
@@ -25,7 +26,7 @@ def write_rerun(path: Path, recording: Recording) -> int:
     if path.exists():
         raise FileExistsError(f"{path}: exists already and is not overwritten")
     stream = rr.RecordingStream(APPLICATION, recording_id=path.stem)
-    stream.save(path)
+    stream.save(path, default_blueprint=_layout(recording))
     stream.log("scene", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     writer = _Writer(recording, stream)
     for item in recording.items():
@@ -33,6 +34,22 @@ def write_rerun(path: Path, recording: Recording) -> int:
     stream.flush()
     stream.disconnect()
     return writer.n_logged
+
+
+def _layout(recording: Recording) -> Any:
+    """Every camera, below them the scene, the map and the words."""
+    cameras = [
+        rrb.Spatial2DView(origin=f"drone_{drone_id}/camera", name=f"drone {drone_id}")
+        for drone_id in recording.fleet.drone_ids
+    ]
+    around = (
+        rrb.Spatial3DView(origin="scene", name="scene, m"),
+        rrb.MapView(origin="map", name="map"),
+        rrb.TextLogView(origin="log", name="log"),
+    )
+    return rrb.Blueprint(
+        rrb.Vertical(rrb.Grid(*cameras), rrb.Horizontal(*around), row_shares=[3, 2]), collapse_panels=True
+    )
 
 
 class _Writer:
