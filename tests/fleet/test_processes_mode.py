@@ -49,11 +49,13 @@ HUNG_DRONE, HUNG_PROCESS = 3, "assigner"  # stopped in the air, not killed: only
 # looks at.
 KILLED_ON_THE_WAY = ("camera", "detector", "tracker", "logger", "registrar", "assigner", "relay")
 KILLED_WHILE_WATCHING = ("navigator", "autopilot")
+STARTED_S, BEAT_S = 2.0, 5.0  # promised of a killed process: there again, and heard again
+KEPT_UP = (
+    0.9  # of real time: below it the machine had other work, and the promise holds for the usual process
+)
 RESPAWN_LIMIT_S = 45.0  # of a machine that does five other things; an idle one takes about 2
 GONE_LIMIT_S = 20.0
 FLIGHT_LIMIT_S = 400.0  # about 150 where the machine keeps up
-# The judge asks 90 % of a flight in peace; here processes die within the window, on a machine of any load.
-LEAST_DISTINCT_SHARE = 0.8
 RATE_TOLERANCE = 0.35
 
 
@@ -127,7 +129,7 @@ class Flight:
     respawn_s: dict[str, float]
     left_running: list[str]
     left_in_memory: list[str]
-    wall_s: float
+    realtime_factor: float
     verdict: Verdict
     screen: Killer
 
@@ -155,6 +157,7 @@ def flight(near: SimMission, tmp_path_factory: pytest.TempPathFactory) -> Flight
             fleet.look()
             over = watch.step(fleet.now_s, fleet, 1.0)
         wall_s = time.monotonic() - began
+        realtime_factor = fleet.now_s / wall_s
         write_truth_notes(plan, watch, "processes", "", fleet.now_s, wall_s)
         tree = running(plan.folder)
         assert len(tree) == 2 + 9 * len(near.roster), "supervisord, the world and nine processes a drone"
@@ -164,7 +167,7 @@ def flight(near: SimMission, tmp_path_factory: pytest.TempPathFactory) -> Flight
     memory = [path.name for path in SHARED_FOLDER.glob(f"podwatch_{fleet._run}_*")]
     truth = load_run(plan.folder)
     verdict = judge(truth.truth, truth.drones)
-    return Flight(plan, killer.respawn_s, left_running, memory, wall_s, verdict, killer)
+    return Flight(plan, killer.respawn_s, left_running, memory, realtime_factor, verdict, killer)
 
 
 def is_alive(process: psutil.Process) -> bool:
@@ -181,6 +184,10 @@ def test_every_process_of_a_drone_comes_back_from_kill_9(flight, record_property
         print(f"{name}: started {flight.screen.started_s[name]:.2f} s after its kill, beat after ", end="")
         print(f"{flight.respawn_s[name]:.2f} s")
     assert sorted(flight.respawn_s) == sorted(processes.BY_NAME)
+    print(f"realtime factor {flight.realtime_factor:.2f}")
+    worst = max if flight.realtime_factor >= KEPT_UP else np.median
+    assert worst([*flight.screen.started_s.values()]) <= STARTED_S, flight.screen.started_s
+    assert worst([*flight.respawn_s.values()]) <= BEAT_S, flight.respawn_s
 
 
 def test_a_process_that_hangs_is_killed_and_comes_back_and_no_other_is_taken_for_hung(flight):
@@ -196,11 +203,14 @@ def test_the_drone_whose_processes_were_killed_ends_on_the_ground_like_the_other
 
 def test_each_drone_still_watched_an_animal_of_its_own(flight):
     verdict = flight.verdict
+    print(
+        f"distinct: {verdict.distinct}, for {verdict.distinct_share or 0:.1%} of {verdict.monitor_window_s}"
+    )
     animals = [drone.animal for drone in verdict.drones]
     assert None not in animals, verdict.reasons
     assert len(set(animals)) == len(animals), verdict.reasons
     assert all(drone.is_assigned for drone in verdict.drones)
-    assert (verdict.distinct_share or 0.0) >= LEAST_DISTINCT_SHARE, verdict.reasons
+    assert verdict.distinct, verdict.reasons
 
 
 def test_the_run_says_that_processes_flew_and_nothing_fell_back(flight):
