@@ -36,7 +36,10 @@ class Settings:
     steps: int = 8000  # 7 minutes on one idle core; more steps still help
     rate: float = 3e-3  # the highest that never diverged with AdamW on this network
     cosine_steps: int = 10_000  # the rate follows a cosine to its end here ...
-    cooldown_steps: int = 2000  # ... and falls to zero over the last steps, which settles near ties
+    cooldown_steps: int = 2000  # ... and falls to zero over the last of `steps`, which settles near ties
+    polish_steps: int = 1200  # then mostly five agents with few goals to spare, the hardest for its size,
+    polish_rate: float = 1e-3  # from this rate down to zero
+    polish_third: float = 0.5  # and the third round, whose lists gnn+resolve floods, weighs this
     warmup_steps: int = 100
     weight_decay: float = 1e-4
     average_decay: float = 0.998  # the exported weights are a running mean over about 500 steps
@@ -59,11 +62,14 @@ def batch_tensors(batch: Batch, random: np.random.Generator) -> tuple[Tensor, Te
     return features, allowed, torch.from_numpy(delivered.astype(np.float32)), labels
 
 
-def assignment_loss(outs: list[Tensor], labels: Tensor, n_goals: int, settings: Settings) -> Tensor:
+def assignment_loss(
+    outs: list[Tensor], labels: Tensor, n_goals: int, settings: Settings, polishing: bool = False
+) -> Tensor:
     """Cross-entropy after the last round and, weighed less, earlier ones, and expected clashing pairs."""
     n = labels.shape[1]
     loss = functional.cross_entropy(outs[-1].flatten(0, 1), labels.flatten())
-    for logits, weight in zip(outs[:-1], settings.round_weights, strict=False):
+    for number, (logits, share) in enumerate(zip(outs[:-1], settings.round_weights, strict=False)):
+        weight = settings.polish_third if polishing and number == 3 else share
         if weight > 0:
             loss = loss + weight * functional.cross_entropy(logits.flatten(0, 1), labels.flatten())
     chances = outs[-1].softmax(dim=-1)[..., :n_goals]  # (B, n, g)
@@ -75,6 +81,8 @@ def assignment_loss(outs: list[Tensor], labels: Tensor, n_goals: int, settings: 
 def _rate(settings: Settings, step: int) -> float:
     warm = min(1.0, (step + 1) / settings.warmup_steps)
     slope = 0.01 + 0.99 * 0.5 * (1 + float(np.cos(np.pi * step / settings.cosine_steps)))
+    if step >= settings.steps:
+        return settings.polish_rate * (1 - (step - settings.steps) / settings.polish_steps)
     return settings.rate * warm * slope * min(1.0, (settings.steps - step) / settings.cooldown_steps)
 
 
@@ -135,11 +143,13 @@ def _start(settings: Settings) -> _Run:
 def _step(run: _Run, settings: Settings) -> float:
     """One step of the optimiser; returns the loss."""
     random = np.random.default_rng([settings.seed, APART, run.step])
-    batch = mixed_batch(random)
+    polishing = run.step >= settings.steps
+    batch = mixed_batch(random, polishing)
     seen, allowed, delivered, labels = batch_tensors(batch, random)
     for group in run.optimiser.param_groups:
         group["lr"] = _rate(settings, run.step)
-    loss = assignment_loss(run.network(seen, allowed, delivered), labels, batch.costs.shape[2], settings)
+    outs = run.network(seen, allowed, delivered)
+    loss = assignment_loss(outs, labels, batch.costs.shape[2], settings, polishing)
     if not torch.isfinite(loss):
         raise FloatingPointError(
             f"the loss is {loss.item()} at step {run.step}: lower Settings.rate ({settings.rate})"
@@ -164,9 +174,10 @@ def train(out: Path, settings: Settings, stop_after: int | None = None) -> Path:
     run, checkpoint = _start(settings), out / "checkpoint.pt"
     if checkpoint.is_file():
         run.load(checkpoint, settings)
-        print(f"goes on at step {run.step} of {settings.steps}", flush=True)
+        print(f"goes on at step {run.step} of {settings.steps + settings.polish_steps}", flush=True)
     begun, losses = time.process_time() - run.seconds, []
-    while run.step < min(settings.steps, stop_after or settings.steps):
+    last = settings.steps + settings.polish_steps
+    while run.step < min(last, stop_after or last):
         losses.append(_step(run, settings))
         run.seconds = time.process_time() - begun
         if run.step % 100 == 0:
@@ -181,7 +192,7 @@ def train(out: Path, settings: Settings, stop_after: int | None = None) -> Path:
 def command(out: Path, seed: int, steps: int | None, smoke: bool) -> None:
     """What `podwatch train assigner` does: train, export, check the export, measure it."""
     if smoke:
-        settings = Settings(seed=seed, steps=20, warmup_steps=5, cooldown_steps=5)
+        settings = Settings(seed=seed, steps=20, warmup_steps=5, cooldown_steps=5, polish_steps=5)
         out = out / "smoke"
     else:
         settings = Settings(seed=seed, steps=steps or Settings.steps)

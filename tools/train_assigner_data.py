@@ -11,6 +11,8 @@ __all__ = ["Batch", "instances", "mixed_batch", "solved"]
 Floats = NDArray[np.float64]
 
 LONG_RING_SHARE = 0.08  # rings of 9 to 24: what 1 to 8 teaches must also hold on longer ones
+POLISH_FIVE_SHARE = 0.8
+POLISH_TIGHT_SHARE = 0.5  # of these, at most two goals to spare
 FIVE_SHARE = 0.55  # five agents: the paper's fleet
 SURPLUS_SHARE = 0.04  # fewer goals than agents
 SLOT_SHARE = 0.08  # drones on the mission's slots round the pod instead of anywhere in the square
@@ -56,10 +58,12 @@ def solved(costs: Floats) -> NDArray[np.int64]:
     return labels
 
 
-def mixed_batch(random: np.random.Generator) -> Batch:
-    """A batch of one size, drawn from the mixture that the shares above describe."""
+def mixed_batch(random: np.random.Generator, polishing: bool = False) -> Batch:
+    """A batch of one size, drawn from the mixture that the shares above describe; while polishing, mostly
+    five agents with few goals to spare.
+    """
     draw, rounds = random.random(), 5
-    if draw < FIVE_SHARE:
+    if draw < (POLISH_FIVE_SHARE if polishing else FIVE_SHARE):
         n_agents = 5
     elif draw < 1 - LONG_RING_SHARE:
         n_agents = int(random.integers(1, 9))
@@ -70,11 +74,10 @@ def mixed_batch(random: np.random.Generator) -> Batch:
         n_goals = int(random.integers(1, n_agents + 1))
     else:
         # Few spare goals are the hard case; up to twice as many goals as agents, and a few beyond.
-        spare = (
-            int(random.integers(0, max(n_agents, 2) + 1))
-            if random.random() < 0.9
-            else int(random.integers(0, 16))
-        )
+        most = max(n_agents, 2) if random.random() < 0.9 else 15
+        if polishing and n_agents == 5 and random.random() < POLISH_TIGHT_SHARE:
+            most = 2
+        spare = int(random.integers(0, most + 1))
         n_goals = n_agents + spare
     count = max(CELLS // (n_agents * n_goals), 8)
     if random.random() < SLOT_SHARE:

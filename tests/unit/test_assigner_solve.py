@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 from scipy.optimize import linear_sum_assignment
 
 from procs.assigner.costs import FORBIDDEN, UNIT, code_values, cost_codes, solve_table
-from procs.assigner.solve import assign
+from procs.assigner.flood import RowAgent
+from procs.assigner.solve import assign, assign_many
 
 quick = settings(deadline=None, max_examples=80)
 
@@ -68,15 +69,45 @@ def test_the_exact_method_is_optimal_within_its_rounds_and_bytes(n: int) -> None
         assert np.mean(quality) >= 0.99999
 
 
-@pytest.mark.parametrize(("loss", "share"), [(0.1, 0.995), (0.2, 0.97)])
+@pytest.mark.parametrize(("loss", "share"), [(0.1, 0.9995), (0.2, 0.995)])
 def test_whole_tables_outlast_loss(loss: float, share: float) -> None:
-    random = np.random.default_rng(0)
-    results = [assign(random.random((5, 7)), loss=loss, seed=k) for k in range(400)]
-    assert np.mean([result.is_distinct for result in results]) >= share
-    for result in results:
-        taken = result.goals[result.goals >= 0]
+    costs = np.random.default_rng(0).random((5000, 5, 7))
+    many = assign_many(costs, loss=loss, seed=1)
+    assert many.rounds == 5
+    assert many.is_distinct.mean() >= share
+    for one in many.goals:
+        taken = one[one >= 0]
         assert len(set(taken.tolist())) == len(taken)
-        assert result.is_distinct == (len(taken) == 5)
+
+
+@pytest.mark.parametrize("n", [2, 3, 6])
+@pytest.mark.parametrize("loss", [0.3, 0.8])
+def test_agents_under_loss_decide_as_the_evaluator_says(n: int, loss: float) -> None:
+    for seed in range(20):
+        costs = np.random.default_rng(seed).random((n, n + 1))
+        one, many = assign(costs, loss=loss, seed=seed), assign_many(costs[None], loss=loss, seed=seed)
+        np.testing.assert_array_equal(one.goals, many.goals[0])
+        np.testing.assert_array_equal(one.bytes_sent, many.bytes_sent[0])
+        assert one.is_distinct == many.is_distinct[0] == ((one.goals >= 0).all())
+
+
+def test_a_table_that_is_cut_short_counts_as_not_come() -> None:
+    agents = [RowAgent(np.array([1.0, 2.0]), k, 3, lossy=True) for k in range(3)]
+    said = agents[1].step([])
+    agents[0].step([])
+    agents[0].step([said[0][:-1], b"", b"\x01\xff\xff", said[0][:1] + b"\x08" + said[0][2:]])
+    assert sorted(agents[0].rows) == [0]
+    agents[0].step([said[0], said[0]])
+    assert sorted(agents[0].rows) == [0, 1]
+
+
+def test_a_neighbour_is_not_told_again_what_it_said_that_it_holds() -> None:
+    agents = [RowAgent(np.array([1.0, 2.0]), k, 2, lossy=True) for k in range(2)]
+    first, second = (agent.step([]) for agent in agents)
+    assert first == [bytes([0, 1, 1]) + agents[0].rows[0]] * 2
+    assert agents[0].step(second) == [bytes([0, 3, 1]) + agents[0].rows[0]] * 2
+    assert agents[1].step(first) == [bytes([1, 3, 2]) + agents[1].rows[1]] * 2
+    assert agents[0].step([bytes([1, 3, 0])]) == [bytes([0, 3, 0])] * 2
 
 
 def test_with_everything_lost_everybody_holds() -> None:
