@@ -9,12 +9,15 @@ __all__ = ["CONSENSUS_CONFIDENCE", "is_doubted", "is_settled"]
 
 CONSENSUS_CONFIDENCE = 0.9
 MOST_DOUBTED_PER_VIEW = 0.1  # false alarms a view, as a share of the confirmed animals
+LEAST_CONFIRMED = 0.25  # share of the views that should see an animal
 MOST_MISSED = 0.34  # share of an animal's views that may miss it; one miss always may
 
 
 def is_doubted(animal: MapAnimal) -> bool:
-    """One view says it is there, and at least one that should see it does not."""
-    return animal.hits == 1 and animal.misses > 0
+    """One view says it is there, and at least one that should see it does not; or a few say so against many,
+    whose false alarms happened to fall on one place."""
+    few = LEAST_CONFIRMED * (animal.hits + animal.misses)
+    return animal.misses > 0 and 0 < animal.hits <= max(1.0, few)
 
 
 def is_settled(animals: Sequence[MapAnimal], n_views: int) -> bool:

@@ -241,7 +241,9 @@ class RingNode:
             if number is None or number in sight.ids.values() or by_id[number].hits:
                 number = self._free_id(by_id, now_s)
             if number is not None:
-                by_id[number] = new_animal(marks, row, header.origin, number, is_first_view)
+                others_missed = by_id[number].misses if number in by_id else 0
+                added = new_animal(marks, row, header.origin, number, is_first_view)
+                by_id[number] = replace(added, misses=others_missed)
                 sight.ids[row] = number
 
     def _free_id(self, by_id: dict[int, MapAnimal], now_s: float) -> int | None:

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from procs.registrar._verdict import is_doubted
 from procs.registrar.box_icp import BoxAlignment, align_marks
 from procs.registrar.map import HEADER_BYTES, MAX_ANIMALS, MapAnimal, Memory
 from procs.registrar.ring import RingNode, ViewGeometry, register_ring
@@ -145,6 +146,13 @@ def test_views_of_another_pod_are_no_consensus():
     assert not register_ring([view.boxes for view in views], image_size=IMAGE_SIZE).consensus
 
 
+@pytest.mark.parametrize(
+    ("hits", "misses", "doubted"), [(1, 0, False), (1, 1, True), (2, 3, False), (2, 10, True), (0, 3, False)]
+)
+def test_who_alone_or_nearly_alone_sees_an_animal_is_doubted(hits, misses, doubted):
+    assert is_doubted(MapAnimal(0.0, 0.0, 9.0, 0.0, hits, misses, 1)) == doubted
+
+
 def test_a_false_alarm_of_one_view_gets_no_identity():
     views = views_of(5, 3, seed=6)
     middle = np.array([[620.0, 470.0, 660.0, 490.0]])
@@ -153,6 +161,17 @@ def test_a_false_alarm_of_one_view_gets_no_identity():
     answer = register_ring(boxes, image_size=IMAGE_SIZE)
     assert answer.identities[1][-1] == -1
     assert (answer.identities[1][:-1] >= 0).all()
+
+
+def test_a_false_alarm_stays_one_in_a_ring_of_many_laps_and_views():
+    views = views_of(5, 7, seed=6)
+    middle = np.array([[620.0, 470.0, 660.0, 490.0]])
+    boxes = [
+        np.concatenate([view.boxes, middle]) if row == 4 else view.boxes for row, view in enumerate(views)
+    ]
+    answer = register_ring(boxes, image_size=IMAGE_SIZE)
+    assert answer.identities[4][-1] == -1
+    assert answer.consensus
 
 
 def test_an_animal_outside_every_other_view_has_an_id_of_its_own():
