@@ -24,16 +24,18 @@ from procs import processes
 from procs.navigator.states import State
 from procs.processes import Restart
 from procs.settings import DriverSpec, DroneSettings
-from tools.sim.buses import Slot, bus_url, free_udp_ports
-from tools.sim.heartbeats import HeartbeatGuard, Hung
+from tools.buses import Slot, bus_url, free_udp_ports
+from tools.heartbeats import HeartbeatGuard, Hung
 from tools.sim.plan import RunPlan
-from tools.sim.supervision import Supervisor, SupervisorError, program
 from tools.sim.watch import Watch
+from tools.supervision import Supervisor, SupervisorError, program
 
 __all__ = ["ProcessFleet"]
 
 START_LIMIT_S = 90.0
-CHECK_EVERY_S = 2.0
+# supervisord looks at its children once a second, and whenever somebody speaks to it: asked twice a second it
+# starts what has died within one.
+CHECK_EVERY_S = 0.5
 LOOK_S = 0.1
 SHARED_FOLDER = Path("/dev/shm")
 MASK_TRACKER = "procs.tracker.mask_tracker:MaskTracker"
@@ -65,7 +67,8 @@ class ProcessFleet:
         self._page_path = SHARED_FOLDER / f"podwatch_{self._run}_clock"
         self._page = ClockPage(self._page_path, create=True)
         self._write_settings()
-        self.supervisor = Supervisor(plan.folder, roster, self._slot.fileno())
+        world = {"world": ("-m", "tools.sim.world_process", plan.folder / "output" / "world.json")}
+        self.supervisor = Supervisor(plan.folder, roster, self._slot.fileno(), world)
         self._next_check = 0.0
         self._in_flight = False
 
