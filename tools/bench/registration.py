@@ -64,7 +64,8 @@ def command(pairs: int, rings: int, seed: int, only: str, out: Path) -> None:
     if PIXELS in parts:
         with console.status(PIXELS):
             rows += _pixel_rows(seed, out)
-    print_table("podwatch bench registration", rows, console)
+    if rows:
+        print_table("podwatch bench registration", rows, console)
     write_table(out / "bench_registration.json", rows)
     counts = {key: one.counts for key, one in found.items()}
     if PEERS in parts:
