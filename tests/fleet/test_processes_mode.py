@@ -56,7 +56,7 @@ KEPT_UP = (
 RESPAWN_LIMIT_S = 45.0  # of a machine that does five other things; an idle one takes about 2
 GONE_LIMIT_S = 20.0
 # The judge asks 90 %, and so does this test where the machine keeps up. On one that does not, processes that
-# were killed within the window are away for longer: 80 to 98 % were measured under a load of 12 to 24 on 2 cores.
+# were killed within the window are away for longer: 80 to 98 % were measured at loads of 12 to 24 on 2 cores.
 LEAST_DISTINCT_SHARE = 0.7
 FLIGHT_LIMIT_S = 400.0  # about 150 where the machine keeps up
 RATE_TOLERANCE = 0.35
