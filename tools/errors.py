@@ -26,8 +26,8 @@ EXIT_CODES = {
     ("procs.detector.decode", "ModelError"): MISSING,
     ("procs.relay.keys", "FleetKeyError"): MISSING,
     ("procs.runtime", "RuntimeFailure"): MISSING,
-    ("tools.sim.supervision", "CannotStartError"): MISSING,
-    ("tools.sim.supervision", "SupervisorError"): FAILED,
+    ("tools.supervision", "CannotStartError"): MISSING,
+    ("tools.supervision", "SupervisorError"): FAILED,
 }
 
 

@@ -97,7 +97,7 @@ def _open_buses(
     import lcm
 
     from procs.runtime import RuntimeFailure
-    from tools.sim.buses import Slot, bus_url
+    from tools.buses import Slot, bus_url
 
     with ExitStack() as stack:
         if address is None and slot is None:

@@ -22,7 +22,7 @@ from drivers.frames import SharedFrames
 from lcmtypes import channels, make, podwatch
 from lcmtypes.podwatch import frame_t, heartbeat_t, world_state_t
 from procs import processes
-from tools.sim.buses import has_multicast_route
+from tools.buses import has_multicast_route
 
 ROOT = Path(__file__).parents[2]
 DEADLINE_S = 20.0
@@ -233,7 +233,7 @@ CLONE_NEWUSER, CLONE_NEWNET = 0x10000000, 0x40000000
 if ctypes.CDLL(None).unshare(CLONE_NEWUSER | CLONE_NEWNET) != 0:
     os.environ["PODWATCH_TEST_URL"] = "udpm://no.such.group:1"
 import lcm
-from tools.sim.buses import has_multicast_route
+from tools.buses import has_multicast_route
 route = "PODWATCH_TEST_URL" not in os.environ and has_multicast_route()
 try:
     lcm.LCM(os.environ.get("PODWATCH_TEST_URL", sys.argv[1]))

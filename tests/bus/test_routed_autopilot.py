@@ -24,7 +24,7 @@ from logs.reader import read
 from procs.autopilot.bridge import Bridge
 from procs.settings import Mission
 from tests.bus.autopilot_flights import start_twin
-from tools.sim.buses import free_udp_ports
+from tools.buses import free_udp_ports
 from tools.sim.settings import PodTable
 
 ROOT = Path(__file__).parents[2]

@@ -15,9 +15,9 @@ import pytest
 from typer.testing import CliRunner
 
 from drivers.sim.clock import ClockPage
+from tools import buses
+from tools.buses import has_multicast_route
 from tools.cli import app
-from tools.sim import buses
-from tools.sim.buses import has_multicast_route
 from tools.sim.processes import SHARED_FOLDER
 
 ROOT = Path(__file__).parents[2]

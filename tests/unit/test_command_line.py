@@ -17,8 +17,8 @@ from procs.settings import MissionError
 from tools import errors
 from tools.cli import app
 from tools.sim import command, run
-from tools.sim.supervision import CannotStartError, SupervisorError
 from tools.sim.watch import Watch
+from tools.supervision import CannotStartError, SupervisorError
 
 QUICK = ("--lockstep", "--headless", "--sensor", "boxes", "--duration", "2")
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 
 from procs import processes
-from tools.sim.heartbeats import PATIENCE, HeartbeatGuard
+from tools.heartbeats import PATIENCE, HeartbeatGuard
 
 LIMIT_S = processes.BY_NAME["tracker"].heartbeat_limit_s
 REAL_LIMIT_S = PATIENCE * LIMIT_S

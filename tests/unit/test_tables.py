@@ -13,7 +13,7 @@ from lcmtypes import channels, podwatch
 from procs import processes
 from procs.main import EXIT_CANNOT_START
 from procs.processes import Restart
-from tools.sim.supervision import configuration, program
+from tools.supervision import configuration, program
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("lcmtypes", "procs", "drivers", "logs", "tools", "models", "fleets")
@@ -29,6 +29,7 @@ MAY_IMPORT = {
 }
 CHANNEL_NAME_LIMIT_BYTES = 63
 LONGEST_ID = 99
+WORLD = {"world": ("-m", "tools.sim.world_process")}
 # Files that speak MAVLink, which has a message of that name too.
 MAVLINK_NAMES = {"HEARTBEAT"}
 
@@ -226,7 +227,7 @@ def test_every_type_is_generated_and_no_two_types_can_be_taken_for_each_other():
 
 def test_the_supervisors_configuration_is_the_process_table(tmp_path):
     roster = (3, 5)
-    config = configuration(tmp_path, tmp_path / "socket", roster)
+    config = configuration(tmp_path, tmp_path / "socket", roster, WORLD)
     programs = {name.removeprefix("program:") for name in config.sections() if name.startswith("program:")}
     table = {program(drone_id, process.name) for drone_id in roster for process in processes.PROCESSES}
     assert programs == table | {"world"}
@@ -243,7 +244,7 @@ def test_the_supervisors_configuration_is_the_process_table(tmp_path):
 
 def test_the_tree_stops_in_the_order_of_the_table_and_the_world_last(tmp_path):
     """supervisord stops whole groups one after another, the highest priority first."""
-    config = configuration(tmp_path, tmp_path / "socket", (1, 2))
+    config = configuration(tmp_path, tmp_path / "socket", (1, 2), WORLD)
     groups = [config[name] for name in config.sections() if name.startswith("group:")]
     stopped = sorted(groups, key=lambda group: -int(group["priority"]))
     orders = [

@@ -12,9 +12,9 @@ import fleets
 from drivers.sim.render import open_surface
 from procs.runtime import RuntimeFailure
 from procs.settings import DroneEntry, MissionError, load_mission, validate
+from tools.buses import has_multicast_route
 from tools.errors import INTERRUPTED, plain_errors
 from tools.live import LiveView
-from tools.sim.buses import has_multicast_route
 from tools.sim.expect import check, read_safety
 from tools.sim.plan import RunPlan
 from tools.sim.run import finish, fly_lockstep, fly_processes, new_folder

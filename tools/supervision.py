@@ -1,4 +1,6 @@
-"""supervisord for a simulated fleet: its configuration from the process table, and talking to it."""
+"""supervisord for one drone or a whole simulated fleet: its configuration from the process table, and talking
+to it.
+"""
 
 import configparser
 import contextlib
@@ -8,6 +10,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+from collections.abc import Mapping
 from http.client import HTTPException
 from pathlib import Path
 from typing import Any
@@ -21,7 +24,6 @@ __all__ = ["CannotStartError", "Supervisor", "SupervisorError", "configuration",
 
 STOP_WAIT_S = 6
 START_TRIES = 5
-WORLD = "world"
 ONE_THREAD = "OMP_NUM_THREADS=1,OPENBLAS_NUM_THREADS=1,MKL_NUM_THREADS=1"
 
 
@@ -38,8 +40,16 @@ def program(drone_id: int, process: str) -> str:
     return f"{process}_{drone_id}"
 
 
-def configuration(folder: Path, socket: Path, roster: tuple[int, ...]) -> configparser.RawConfigParser:
-    """The whole tree: the world, and for each drone a program for each row of the process table."""
+Leading = Mapping[str, tuple[str | Path, ...]]  # name -> what this Python is to run
+
+
+def configuration(
+    folder: Path, socket: Path, drone_ids: tuple[int, ...], leading: Leading | None = None
+) -> configparser.RawConfigParser:
+    """The whole tree: for each drone a program for each row of the process table.
+
+    leading: programs that start before all drones and stop after them, and without which nothing can go on.
+    """
     config = configparser.RawConfigParser()
     config["unix_http_server"] = {"file": str(socket), "chmod": "0700"}
     config["supervisord"] = {
@@ -52,14 +62,15 @@ def configuration(folder: Path, socket: Path, roster: tuple[int, ...]) -> config
     factory = "supervisor.rpcinterface:make_main_rpcinterface"
     config["rpcinterface:supervisor"] = {"supervisor.rpcinterface_factory": factory}
     config["supervisorctl"] = {"serverurl": f"unix://{socket}"}
-    config[f"program:{WORLD}"] = {
-        "command": _command("-m", "tools.sim.world_process", folder / "output" / "world.json"),
-        "priority": "1",
-        **_common(folder, WORLD),
-        "autorestart": "false",
-    }
+    for name, words in (leading or {}).items():
+        config[f"program:{name}"] = {
+            "command": _command(*words),
+            "priority": "1",
+            **_common(folder, name),
+            "autorestart": "false",
+        }
     groups: dict[int, list[str]] = {}
-    for drone_id in roster:
+    for drone_id in drone_ids:
         for process in processes.PROCESSES:
             name = program(drone_id, process.name)
             groups.setdefault(process.stop_order, []).append(name)
@@ -108,8 +119,11 @@ def _common(folder: Path, name: str) -> dict[str, str]:
 class Supervisor:
     """One supervisord with its tree; ends with the process that made it."""
 
-    def __init__(self, folder: Path, roster: tuple[int, ...], lock: int) -> None:
+    def __init__(
+        self, folder: Path, drone_ids: tuple[int, ...], lock: int, leading: Leading | None = None
+    ) -> None:
         """`lock`: a file descriptor that supervisord holds open for as long as it runs."""
+        self._leading = tuple(leading or ())
         self._output = folder / "output"
         self._output.mkdir(exist_ok=True)
         # A socket's path holds at most 107 bytes, and a run's folder may be deep.
@@ -117,10 +131,10 @@ class Supervisor:
         socket = Path(self._socket_folder.name) / "supervisor.sock"
         path = self._output / "supervisord.conf"
         with path.open("w") as file:
-            configuration(folder, socket, roster).write(file)
+            configuration(folder, socket, drone_ids, leading).write(file)
         with (self._output / "supervisord.err").open("w") as errors:
             self._popen = subprocess.Popen(
-                [sys.executable, "-m", "tools.sim.supervised", str(path)],
+                [sys.executable, "-m", "tools.supervised", str(path)],
                 stdout=subprocess.DEVNULL,
                 stderr=errors,
                 stdin=subprocess.DEVNULL,
@@ -155,16 +169,13 @@ class Supervisor:
             # What was killed is EXITED too, for the moment until it is started again. What says that it
             # cannot start is not tried five times.
             cannot = state in ("EXITED", "BACKOFF", "FATAL") and row["exitstatus"] == EXIT_CANNOT_START
-            if in_flight and name != WORLD and (state == "FATAL" or (cannot and state == "EXITED")):
-                with (
-                    contextlib.suppress(Fault),
-                    _proxy(self._socket) as proxy,
-                ):  # Fault: it runs again
-                    proxy.supervisor.startProcess(f"{row['group']}:{name}", False)
+            if in_flight and name not in self._leading:
+                if state == "FATAL" or (cannot and state == "EXITED"):
+                    # Fault: it runs again.
+                    with contextlib.suppress(Fault), _proxy(self._socket) as proxy:
+                        proxy.supervisor.startProcess(f"{row['group']}:{name}", False)
                 continue
-            if in_flight and name != WORLD:
-                continue
-            if cannot or state == "FATAL" or (state == "EXITED" and name == WORLD):
+            if cannot or state == "FATAL" or (state == "EXITED" and name in self._leading):
                 output = (self._output / f"{name}.txt").read_text(errors="replace").strip()
                 last = output.splitlines()[-1] if output else "it said nothing"
                 kind = CannotStartError if cannot else SupervisorError

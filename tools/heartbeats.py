@@ -1,7 +1,7 @@
-"""Which processes of a simulated fleet hang: they live, so supervisord sees nothing wrong, and say nothing.
+"""Which processes of a drone hang: they live, so supervisord sees nothing wrong, and say nothing.
 
-A dead process is supervisord's to start again. One that hangs is known by its missing heartbeats alone; on a
-real drone the watchdog of its systemd unit does what this does here.
+A dead process is supervisord's to start again. One that hangs is known by its missing heartbeats alone; where
+systemd runs a drone, the watchdog of its unit does what this does here.
 """
 
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Become supervisord, and end when the tool that started it ends: `python -m tools.sim.supervised CONFIG`."""
+"""Become supervisord, and end when the tool that started it ends: `python -m tools.supervised CONFIG`."""
 
 import os
 import sys
