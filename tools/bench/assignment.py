@@ -29,13 +29,15 @@ QUICK_CASES = 200  # a size
 PRINTED = (FIVE, EXACT, LOSSY, HONEST, LARGER, LOSS, FLIGHT, TIME, RULE)
 
 
-def command(seed: int, out: Path, *, quick: bool, draw_into: Path | None = None) -> None:
+def command(seed: int, cases: int, out: Path, *, quick: bool, draw_into: Path | None = None) -> None:
     """Measure all, then print one table a part, write bench_assignment.json and the figures.
 
-    quick: few cases a size, for a look and for tests. draw_into: folder of the figures, `out` where None.
+    cases: of each size up to 12 agents. quick: few cases a size, for a look and for tests. draw_into: folder
+    of the figures, `out` where None.
     """
     console = Console()
-    measures = bars.Measures(seed, QUICK_CASES if quick else 5000)
+    count = min(cases, QUICK_CASES) if quick else cases
+    measures = bars.Measures(seed, count)
     rings = large.LargeRings(seed, quick=quick)
     # What all runs said of themselves is known only after them.
     parts: list[Part] = [

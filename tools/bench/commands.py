@@ -59,6 +59,7 @@ def bench_registration(
 @bench.command("assignment")
 def bench_assignment(
     seed: Annotated[int, typer.Option(min=0, help="Of the cases.")] = 0,
+    cases: Annotated[int, typer.Option(min=1, help="Of each size up to 12 agents.")] = 5000,
     out: Annotated[Path, typer.Option(help="Folder for the table and the figures.")] = Path("runs/bench"),
     quick: Annotated[bool, typer.Option("--quick", help="Few cases a size, small rings.")] = False,
 ) -> None:
@@ -66,7 +67,7 @@ def bench_assignment(
     from tools.bench.assignment import command
 
     with plain_errors():
-        command(seed, out, quick=quick)
+        command(seed, cases, out, quick=quick)
 
 
 @bench.command("logs")
