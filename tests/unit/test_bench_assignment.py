@@ -139,6 +139,7 @@ def test_the_whole_benchmark_on_few_cases(
     monkeypatch.setattr("tools.bench.assignment.QUICK_CASES", 4)
     monkeypatch.setattr(large, "QUICK_COUNTS", {12: 2})
     monkeypatch.setattr("tools.bench.assignment_bars.CHECKED", 1)
+    monkeypatch.setattr("tools.bench.assignment_bars.TRAINING_SEEDS", (0,))
     command(0, 5000, tmp_path, quick=True)
     rows = json.loads((tmp_path / "bench_assignment.json").read_text())
     missing = [row["name"] + ": " + row["why"] for row in rows if row["figure"] is None]
