@@ -231,7 +231,7 @@ def test_foxglove_gets_pictures_with_boxes_masks_and_identities(shown):
     picture = of(shown, "/drone_1/camera")[0]
     image = cv2.imdecode(np.frombuffer(picture.data, np.uint8), cv2.IMREAD_COLOR)
     assert (image.shape, picture.format, picture.frame_id) == ((240, 320, 3), "jpeg", "drone_1")
-    marks = of(shown, "/drone_1/marks")[-1]
+    marks = [message for message in of(shown, "/drone_1/marks") if len(message.points) == 3][-1]
     corners = [[(point.x, point.y) for point in line.points] for line in marks.points]
     # in px of the preview, which has half of the frame's
     assert corners == [
@@ -243,6 +243,14 @@ def test_foxglove_gets_pictures_with_boxes_masks_and_identities(shown):
     animal, nobody, mask = [line.outline_color for line in marks.points]
     assert animal == mask != nobody
     assert marks.points[2].fill_color.a > 0
+
+
+def test_marks_are_those_of_a_pictures_instant(shown):
+    """Pictures come each 0.5 s, tracks each 0.2 s: at every second picture none is of the same frame."""
+    times = [time_ns for topic, time_ns, _ in shown if topic == "/drone_1/camera"]
+    newest = {time_ns: len(message.points) for topic, time_ns, message in shown if topic == "/drone_1/marks"}
+    assert list(newest) == times
+    assert list(newest.values()) == [3, 2, 3, 2, 3, 2, 3, 2]
 
 
 def test_foxglove_gets_positions_a_scene_and_words(shown):

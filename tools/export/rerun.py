@@ -102,16 +102,15 @@ class _Writer:
                 colors=[colour_of(box.animal) for box in item.boxes],
             ),
         )
-        if item.masks:
-            self._log(
-                f"drone_{item.drone_id}/camera/mask",
-                rr.LineStrips2D(
-                    [_closed(mask) * scale for mask in item.masks],
-                    labels=[mask.label for mask in item.masks],
-                    colors=[colour_of(mask.animal) for mask in item.masks],
-                    radii=[1.5] * len(item.masks),
-                ),
-            )
+        self._log(
+            f"drone_{item.drone_id}/camera/mask",
+            rr.LineStrips2D(
+                [_closed(mask) * scale for mask in item.masks],
+                labels=[mask.label for mask in item.masks],
+                colors=[colour_of(mask.animal) for mask in item.masks],
+                radii=[1.0] * len(item.masks),
+            ),
+        )
 
     def _place(
         self,

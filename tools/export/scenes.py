@@ -1,6 +1,7 @@
 """What a fleet's logs show, item by item on one clock: the one source of every export."""
 
 import json
+from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import datetime
@@ -32,6 +33,10 @@ COLOURS = (
     (204, 121, 167),
 )
 NOBODY = (160, 160, 160)  # a box without an identity
+# Pictures are rarer than what is seen in them: marks of another instant would lie beside the animals.
+BOXES_REACH_US = 100_000
+MASK_REACH_US = 26_000  # half a frame: the very frame
+RECENT_PICTURES = 8
 
 
 @dataclass(frozen=True)
@@ -57,7 +62,10 @@ class Outline:
 
 @dataclass(frozen=True)
 class Marks:
-    """What a drone sees in its newest frame: boxes with identities, and the mask that it tracks."""
+    """What a drone sees in one picture, at that picture's time: boxes with identities, the mask it tracks.
+
+    A later one of the same time knows more.
+    """
 
     at_us: int
     drone_id: int
@@ -108,6 +116,17 @@ class Note:
     text: str
 
 
+@dataclass
+class _Shown:
+    """A picture that marks may still come for."""
+
+    utime: int
+    at_us: int
+    boxes: tuple[Outline, ...] = ()
+    boxes_miss_us: int = BOXES_REACH_US + 1
+    masks: tuple[Outline, ...] = ()
+
+
 Item = Picture | Marks | DronePose | AnimalSight | Note
 
 
@@ -151,7 +170,8 @@ class _View:
         self._recording = recording
         self._line = recording.fleet.lines[drone_id]
         self._state, self._animal = "", -1
-        self._boxes: tuple[Outline, ...] = ()
+        self._newest_boxes: tuple[int, tuple[Outline, ...]] = (-BOXES_REACH_US, ())  # utime, boxes
+        self._recent: deque[_Shown] = deque(maxlen=RECENT_PICTURES)
         self._trouble: dict[str, str] = {}
         self._has_whole = False
         self._takers = {
@@ -187,7 +207,7 @@ class _View:
             )  # fmt: skip
 
     def _identities(self, message: Any, at_us: int) -> Iterator[Item]:
-        self._boxes = tuple(
+        boxes = tuple(
             Outline(
                 (
                     (box.left_px, box.top_px),
@@ -200,7 +220,10 @@ class _View:
             )
             for box, animal in zip(message.boxes, message.ids, strict=True)
         )
-        yield Marks(at_us, self._drone_id, self._boxes, ())
+        self._newest_boxes = (message.utime, boxes)
+        for shown in self._recent:
+            if self._take_boxes(shown):
+                yield self._marks(shown)
         for seen in message.map:
             if seen.mine:
                 latitude, longitude = self._recording.on_globe(seen.n_m, seen.e_m)
@@ -208,6 +231,18 @@ class _View:
                     at_us, self._drone_id, seen.id, (seen.n_m, seen.e_m, 0.0), seen.size_m, latitude,
                     longitude, seen.residual_m,
                 )  # fmt: skip
+
+    def _take_boxes(self, shown: _Shown) -> bool:
+        """Whether the newest boxes are nearer to a picture's instant than those that it has."""
+        utime, boxes = self._newest_boxes
+        miss_us = abs(utime - shown.utime)
+        if miss_us >= shown.boxes_miss_us:
+            return False
+        shown.boxes, shown.boxes_miss_us = boxes, miss_us
+        return True
+
+    def _marks(self, shown: _Shown) -> Marks:
+        return Marks(shown.at_us, self._drone_id, shown.boxes, shown.masks)
 
     def _track(self, message: Any, at_us: int) -> Iterator[Item]:
         if message.state != track_t.TRACKING:
@@ -219,7 +254,10 @@ class _View:
             (message.left_px, message.bottom_px),
         )
         mask = Outline(points, message.animal, f"watching {message.animal}")
-        yield Marks(at_us, self._drone_id, self._boxes, (mask,))
+        for shown in self._recent:
+            if abs(message.utime - shown.utime) <= MASK_REACH_US:
+                shown.masks = (mask,)
+                yield self._marks(shown)
 
     def _picture(self, message: Any, at_us: int) -> Iterator[Item]:
         jpeg = bytes(message.data)
@@ -230,6 +268,10 @@ class _View:
             _, encoded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
             jpeg = encoded.tobytes()
         yield Picture(at_us, self._drone_id, jpeg, message.width, message.height, message.scale)
+        shown = _Shown(message.utime, at_us)
+        self._take_boxes(shown)
+        self._recent.append(shown)
+        yield self._marks(shown)
 
     def _mission(self, message: Any, at_us: int) -> Iterator[Item]:
         state = State(message.state).name if message.state in list(State) else str(message.state)
