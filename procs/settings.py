@@ -16,11 +16,13 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 __all__ = [
     "AssignSettings",
+    "BoatSettings",
     "CameraSettings",
     "DriverSpec",
     "DroneSettings",
     "LimitSettings",
     "LogSettings",
+    "MachineSettings",
     "Mission",
     "MissionError",
     "RadioSettings",
@@ -143,12 +145,38 @@ class LogSettings(Section):
     frames: bool = False  # whole frames too, to replay what looks at pixels: about 1 MB each
 
 
+class DriverSpec(Section):
+    """A driver by name, `package.module:Class`, and its options: how a process gets its edge without knowing
+    which.
+    """
+
+    driver: str = Field(pattern=r"^[\w.]+:\w+$")
+    options: dict[str, Any] = {}
+
+
+class MachineSettings(Section):
+    """What one drone's own computer is wired to: for `podwatch fly`, of no weight in a simulated fleet."""
+
+    camera: str = Field("v4l2:/dev/video0", pattern=r"^(v4l2|gstreamer|ffmpeg|pictures):.+$")
+    autopilot: str = Field("serial:/dev/ttyAMA0:921600", pattern=r"^(udp|udpout|tcp|serial):.+:\d+$")
+    radio: str = Field(pattern=r"^[^\s:]+:\d{1,5}$")  # where the others reach its relay
+    drivers: dict[str, DriverSpec] = {}  # in place of those that follow from the above
+
+
+class BoatSettings(Section):
+    """The boat, roster member 0."""
+
+    radio: str = Field("", pattern=r"^([^\s:]+:\d{1,5})?$")  # where the drones reach it; empty: there is none
+    drivers: dict[str, DriverSpec] = {}  # its clock, where that is not the machine's
+
+
 class DroneEntry(Section):
     """One drone of the roster."""
 
     id: int = Field(ge=1, le=99)
     home_n_m: float = Field(0.0, ge=-1000, le=1000)
     home_e_m: float = Field(0.0, ge=-1000, le=1000)
+    machine: MachineSettings | None = None
 
 
 class Mission(Section):
@@ -164,6 +192,7 @@ class Mission(Section):
     limits: LimitSettings = LimitSettings()
     radio: RadioSettings = RadioSettings()
     log: LogSettings = LogSettings()
+    boat: BoatSettings = BoatSettings()
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
@@ -227,17 +256,8 @@ class Mission(Section):
         raise KeyError(f"drone {drone_id} is not in the roster {self.roster}")
 
 
-class DriverSpec(Section):
-    """A driver by name, `package.module:Class`, and its options: how a process gets its edge without knowing
-    which.
-    """
-
-    driver: str = Field(pattern=r"^[\w.]+:\w+$")
-    options: dict[str, Any] = {}
-
-
 class DroneSettings(Section):
-    """All that one drone's processes are told; `podwatch sim` writes it as JSON."""
+    """All that one drone's processes are told; `podwatch sim` and `podwatch fly` write it as JSON."""
 
     drone_id: int = Field(ge=1, le=99)
     mission: Mission
@@ -311,7 +331,7 @@ def _explain(item: Any, model: type[BaseModel]) -> str:
 def _valid_keys(model: type[BaseModel], path: tuple[Any, ...]) -> list[str]:
     """Keys that the table at `path` of the model takes."""
     for part in path:
-        if isinstance(part, int):
+        if part not in model.model_fields:  # a place in a list, or a name that the file chose
             continue
         annotation = model.model_fields[part].annotation
         inner = [a for a in (annotation, *getattr(annotation, "__args__", ())) if isinstance(a, type)]

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from tools import log
+from tools import fleet, log
 from tools.bench.commands import bench
 from tools.errors import plain_errors, wanted_extra
 from tools.play import play
@@ -27,6 +27,7 @@ app.command("sim")(sim)
 app.command("play")(play)
 app.command("replay")(replay_command)
 app.add_typer(log.app, name="log")
+app.add_typer(fleet.app, name="fleet")
 app.add_typer(train, name="train")
 app.add_typer(bench, name="bench")
 

@@ -1,0 +1,84 @@
+"""`podwatch fleet new|keys|check|units`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+
+from procs.settings import MAX_DRONES, MissionError
+from tools.errors import MISSING, plain_errors
+
+__all__ = ["app"]
+
+app = typer.Typer(help="The fleet file: made, keyed, checked, and turned into units.", no_args_is_help=True)
+
+FleetFile = Annotated[Path, typer.Argument(help="The fleet file.", show_default=False)]
+
+
+@app.command("new")
+def new(
+    path: FleetFile = Path("fleet.toml"),
+    drones: Annotated[int, typer.Option(min=1, max=MAX_DRONES, help="How many drones.")] = 3,
+    name: Annotated[str, typer.Option(help="What the fleet is called. [default: the file's name]")] = "",
+) -> None:
+    """Write a fleet file with a comment on every value that people change."""
+    from tools.fleet.template import fleet_text
+
+    with plain_errors():
+        if path.exists():
+            raise MissionError(f"{path} exists already; name another file, or edit this one")
+        if '"' in name or "\\" in name:
+            raise MissionError(f"--name {name}: no quotation marks and no backslashes")
+        path.write_text(fleet_text(name or path.stem, path.name, drones))
+    typer.echo(f"{path}: {drones} {'drone' if drones == 1 else 'drones'}. Next: podwatch fleet keys {path}")
+
+
+@app.command("keys")
+def keys(
+    path: FleetFile = Path("fleet.toml"),
+    force: Annotated[bool, typer.Option("--force", help="Replace a key that is there.")] = False,
+) -> None:
+    """Make the fleet key, readable by its owner alone; copy it to every drone and the boat."""
+    from procs.relay.keys import make_key
+    from tools.fleet.machine import read_fleet
+
+    with plain_errors():
+        mission = read_fleet(path)
+        key = Path(mission.radio.key_file)
+        if key.exists() and not force:
+            raise MissionError(
+                f"{key} exists: a new key shuts out every drone that holds the old; --force replaces it"
+            )
+        make_key(key, force)
+    typer.echo(f"{key}: made, mode 0600. Copy it to every machine of the fleet (scp -p), and to nobody else.")
+
+
+@app.command("check")
+def check(
+    path: FleetFile = Path("fleet.toml"),
+    drone: Annotated[int | None, typer.Option(help="What this drone lacks, on its own machine.")] = None,
+) -> None:
+    """Say what the fleet file, or one drone on its own machine, still lacks, and what mends it.
+
+    Exit code 0 where nothing lacks, 2 for a fleet file that cannot be flown, 3 where something lacks.
+    """
+    from tools.fleet.check import check_drone, check_fleet
+    from tools.fleet.machine import read_fleet
+
+    console = Console(highlight=False)
+    with plain_errors():
+        mission = read_fleet(path)
+        findings = check_fleet(mission, path) if drone is None else check_drone(mission, path, drone)
+    for one in findings:
+        mark, style = ("lacks", "red") if one.lacks else ("ok   ", "green")
+        console.print(f"[{style}]{mark}[/] {one.what:<10}", escape(one.lacks or one.found), soft_wrap=True)
+        if one.mend:  # whole, in a line of its own: to be copied
+            console.print(" " * 16, escape(one.mend), style="bold", soft_wrap=True)
+    n_lacking = sum(1 for one in findings if one.lacks)
+    if n_lacking:
+        typer.echo(
+            f"podwatch: {n_lacking} of {len(findings)} lack something; what mends each is above", err=True
+        )
+        raise typer.Exit(MISSING)
