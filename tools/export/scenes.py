@@ -171,6 +171,7 @@ class _View:
         self._line = recording.fleet.lines[drone_id]
         self._state, self._animal = "", -1
         self._newest_boxes: tuple[int, tuple[Outline, ...]] = (-BOXES_REACH_US, ())  # utime, boxes
+        self._newest_masks: tuple[int, tuple[Outline, ...]] = (-BOXES_REACH_US, ())
         self._recent: deque[_Shown] = deque(maxlen=RECENT_PICTURES)
         self._trouble: dict[str, str] = {}
         self._has_whole = False
@@ -241,6 +242,14 @@ class _View:
         shown.boxes, shown.boxes_miss_us = boxes, miss_us
         return True
 
+    def _take_masks(self, shown: _Shown) -> bool:
+        """Whether the newest mask is of a picture's very frame."""
+        utime, masks = self._newest_masks
+        if abs(utime - shown.utime) > MASK_REACH_US:
+            return False
+        shown.masks = masks
+        return True
+
     def _marks(self, shown: _Shown) -> Marks:
         return Marks(shown.at_us, self._drone_id, shown.boxes, shown.masks)
 
@@ -254,9 +263,9 @@ class _View:
             (message.left_px, message.bottom_px),
         )
         mask = Outline(points, message.animal, f"watching {message.animal}")
+        self._newest_masks = (message.utime, (mask,))
         for shown in self._recent:
-            if abs(message.utime - shown.utime) <= MASK_REACH_US:
-                shown.masks = (mask,)
+            if self._take_masks(shown):
                 yield self._marks(shown)
 
     def _picture(self, message: Any, at_us: int) -> Iterator[Item]:
@@ -270,6 +279,7 @@ class _View:
         yield Picture(at_us, self._drone_id, jpeg, message.width, message.height, message.scale)
         shown = _Shown(message.utime, at_us)
         self._take_boxes(shown)
+        self._take_masks(shown)
         self._recent.append(shown)
         yield self._marks(shown)
 
