@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from drivers.cameras.pinhole import Pinhole
 from lcmtypes import channels
 from logs.exceptions import LogError
-from logs.reader import read, segments
+from logs.reader import pictures, read, segments
 from procs.navigator.states import State
 
 __all__ = [
@@ -255,7 +255,8 @@ def _read_log(folder: Path, drone_id: int, clock: Clock) -> tuple[Samples, list[
     """A drone's messages by channel, and what could not be read: a damaged log costs that drone the rest."""
     samples: Samples = {name: [] for name in READ_CHANNELS}
     problems: list[str] = []
-    for path in segments(folder / f"drone_{drone_id}.mcap"):
+    log = folder / f"drone_{drone_id}.mcap"
+    for path in [*segments(log), *pictures(log)]:
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             try:

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from lcmtypes import channels
+from logs.writer import LogWriter, picture_path
 from procs.navigator.states import State
 from tests.unit.fake_run import FakeRun
 from tools.evidence import EvidenceError, load_run
@@ -144,6 +145,18 @@ def test_a_drone_without_a_log_has_no_strip_and_is_named(tmp_path: Path) -> None
 
 def test_every_state_has_words_and_a_colour() -> None:
     assert set(STATE_WORDS) == {state.name for state in State}
+
+
+def test_previews_that_a_quota_keeps_apart_are_shown_too(folder: Path) -> None:
+    log = folder / "drone_1.mcap"
+    before = load_run(folder).messages[1][channels.PREVIEW]
+    writer = LogWriter(picture_path(log), drone_id=1)
+    writer.write(channels.PREVIEW, before[-1][1].encode(), before[-1][1].utime)
+    writer.close()
+    try:
+        assert len(load_run(folder).messages[1][channels.PREVIEW]) == len(before) + 1
+    finally:
+        picture_path(log).unlink()
 
 
 def test_a_folder_that_is_no_run_is_refused_by_name(tmp_path: Path) -> None:
