@@ -21,7 +21,10 @@ def costs_of(n: int, n_goals: int, seed: int) -> np.ndarray:
 def fleet_of(costs: np.ndarray, method: Method, previous: list[int] | None = None) -> list[Agent]:
     before = previous or [-1] * len(costs)
     ids = IDS[: costs.shape[1]]
-    return [Agent(k, len(costs), row, ids, previous=before[k], method=method) for k, row in enumerate(costs)]
+    return [
+        Agent(k, len(costs), row, ids, previous=before[k], threshold_m=0.0, method=method)
+        for k, row in enumerate(costs)
+    ]
 
 
 @pytest.mark.parametrize("method", ["gnn", "gnn+resolve"])
