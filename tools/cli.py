@@ -9,6 +9,7 @@ import typer
 from tools import fleet, log
 from tools.bench.commands import bench
 from tools.errors import plain_errors, wanted_extra
+from tools.fly import fly
 from tools.play import play
 from tools.replay import replay_command
 from tools.sim.command import sim
@@ -24,6 +25,7 @@ app = typer.Typer(
 )
 train = typer.Typer(help="Train the models that ship (needs the `train` extra).", no_args_is_help=True)
 app.command("sim")(sim)
+app.command("fly")(fly)
 app.command("play")(play)
 app.command("replay")(replay_command)
 app.add_typer(log.app, name="log")

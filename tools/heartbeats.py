@@ -4,11 +4,16 @@ A dead process is supervisord's to start again. One that hangs is known by its m
 systemd runs a drone, the watchdog of its unit does what this does here.
 """
 
+import contextlib
+import os
+import signal
 from dataclasses import dataclass
 
 from procs import processes
+from procs.navigator.states import State
+from procs.processes import Restart
 
-__all__ = ["HeartbeatGuard", "Hung"]
+__all__ = ["HeartbeatGuard", "Hung", "end_hung"]
 
 # A healthy process may be late on a busy machine: it must be silent for its limit of simulation time, and
 # for so many times the limit of real time.
@@ -69,3 +74,23 @@ class HeartbeatGuard:
         for one in hung:
             del self._beats[one.drone_id, one.process]
         return hung
+
+
+def end_hung(hung: Hung, pid: int, state: State) -> str:
+    """Kill a process that hangs, so that its supervisor starts it again -> what people are told.
+
+    pid: what the supervisor says of it now. Nothing is done, and "" said, where it runs anew already, and
+    where the table says that it is never started again while its drone is in `state`.
+    """
+    row = processes.BY_NAME[hung.process]
+    on_ground = state in (State.IDLE, State.LANDED)
+    if (row.restart_ground if on_ground else row.restart_air) is not Restart.ALWAYS:
+        return ""
+    if pid != hung.pid:  # it has ended meanwhile, and its number may be another's
+        return ""
+    with contextlib.suppress(ProcessLookupError):
+        os.kill(pid, signal.SIGKILL)
+    return (
+        f"{hung.process} of drone {hung.drone_id} hangs (no heartbeat for {hung.silent_s:.0f} s): killed, to "
+        "be started again"
+    )

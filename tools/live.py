@@ -24,7 +24,19 @@ from lcmtypes.podwatch import heartbeat_t
 from procs.navigator.states import State
 from tools.evidence import state_name
 
-__all__ = ["LiveView"]
+__all__ = ["SHOWN", "LiveView"]
+
+# The channels that it shows.
+SHOWN = frozenset(
+    {
+        channels.MISSION_STATE,
+        channels.VEHICLE_STATE,
+        channels.LINK_STATE,
+        channels.LOG_STATE,
+        channels.HEARTBEAT,
+        channels.ASSIGNMENT,
+    }
+)
 
 PLAIN_PERIOD_S = 10.0  # of simulation time, between status lines in plain text
 REDRAW_S = 0.2  # of wall time, between pictures on a terminal

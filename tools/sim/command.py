@@ -14,10 +14,11 @@ from procs.runtime import RuntimeFailure
 from procs.settings import DroneEntry, MissionError, load_mission, validate
 from tools.buses import has_multicast_route
 from tools.errors import INTERRUPTED, plain_errors
+from tools.folders import new_folder
 from tools.live import LiveView
 from tools.sim.expect import check, read_safety
 from tools.sim.plan import RunPlan
-from tools.sim.run import finish, fly_lockstep, fly_processes, new_folder
+from tools.sim.run import finish, fly_lockstep, fly_processes
 from tools.sim.settings import Expect, SimMission
 
 __all__ = ["read_mission", "sim", "with_overrides"]

@@ -2,12 +2,9 @@
 radios on loopback.
 """
 
-import contextlib
 import json
-import os
 import secrets
 import select
-import signal
 import time
 from collections.abc import Callable
 from functools import partial
@@ -22,10 +19,9 @@ from lcmtypes import channels
 from lcmtypes.podwatch import heartbeat_t
 from procs import processes
 from procs.navigator.states import State
-from procs.processes import Restart
 from procs.settings import DriverSpec, DroneSettings
 from tools.buses import Slot, bus_url, free_udp_ports
-from tools.heartbeats import HeartbeatGuard, Hung
+from tools.heartbeats import HeartbeatGuard, Hung, end_hung
 from tools.sim.plan import RunPlan
 from tools.sim.watch import Watch
 from tools.supervision import Supervisor, SupervisorError, program
@@ -135,21 +131,11 @@ class ProcessFleet:
         self.supervisor.drop_drone(drone_id, pids)
 
     def _end(self, hung: Hung) -> None:
-        """Kill a process that hangs, so that supervisord starts it again; not one that the table says is
-        never started again.
-        """
-        row = processes.BY_NAME[hung.process]
-        on_ground = self._watch.states.get(hung.drone_id, State.IDLE) in (State.IDLE, State.LANDED)
-        if (row.restart_ground if on_ground else row.restart_air) is not Restart.ALWAYS:
-            return
+        """Kill a process that hangs, so that supervisord starts it again, where the table lets it."""
         _, pid = self.supervisor.states().get(program(hung.drone_id, hung.process), ("", 0))
-        if pid == hung.pid:  # else it has ended meanwhile, and its number may be another's
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(pid, signal.SIGKILL)
-            self._watch.note(
-                f"{hung.process} of drone {hung.drone_id} hangs (no heartbeat for {hung.silent_s:.0f} s): "
-                "killed, to be started again"
-            )
+        told = end_hung(hung, pid, self._watch.states.get(hung.drone_id, State.IDLE))
+        if told:
+            self._watch.note(told)
 
     def _listen(self, drone_id: int) -> Any:
         bus = lcm.LCM(bus_url(drone_id, self._slot.number))

@@ -5,7 +5,6 @@ import json
 import signal
 import time
 from collections.abc import Callable, Iterator
-from datetime import UTC, datetime
 from pathlib import Path
 
 from procs.relay.keys import make_key, read_key
@@ -14,22 +13,9 @@ from tools.sim.plan import RunPlan
 from tools.sim.processes import ProcessFleet
 from tools.sim.watch import Screen, Watch
 
-__all__ = ["finish", "fly_lockstep", "fly_processes", "new_folder", "prepare", "write_truth_notes"]
+__all__ = ["finish", "fly_lockstep", "fly_processes", "prepare", "write_truth_notes"]
 
 STEP_S = 0.25
-
-
-def new_folder(parent: Path) -> Path:
-    """A fresh folder for one run, named by the time; never one that exists."""
-    stamp = datetime.now(tz=UTC).astimezone().strftime("%Y-%m-%d_%H-%M-%S")
-    for attempt in range(1000):
-        folder = parent / (stamp if attempt == 0 else f"{stamp}_{attempt}")
-        try:
-            folder.mkdir(parents=True)
-        except FileExistsError:
-            continue
-        return folder
-    raise FileExistsError(f"{parent / stamp}: a thousand runs began in this second")
 
 
 def prepare(plan: RunPlan) -> None:

@@ -4,6 +4,7 @@ from typing import Protocol
 
 from lcmtypes import channels
 from procs.navigator.states import State
+from tools.live import SHOWN
 from tools.sim.faults import FaultPlan, Victim
 from tools.sim.settings import SimMission
 
@@ -20,18 +21,6 @@ class Screen(Protocol):
     def note(self, now_s: float, text: str) -> None: ...
 
     def tick(self, now_s: float, realtime_factor: float) -> None: ...
-
-
-SHOWN = frozenset(
-    {
-        channels.MISSION_STATE,
-        channels.VEHICLE_STATE,
-        channels.LINK_STATE,
-        channels.LOG_STATE,
-        channels.HEARTBEAT,
-        channels.ASSIGNMENT,
-    }
-)
 
 
 class Watch:
