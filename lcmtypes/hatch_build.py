@@ -1,6 +1,7 @@
 """Build hook: run the pinned lcm's own lcm-gen over lcmtypes/*.lcm, for wheels and for editable installs.
 
-Beside the generated classes it writes type stubs, so that mypy knows every member of every message.
+Beside the generated classes it writes type stubs, so that mypy knows every member of every message, and where
+there is a Java compiler lcmtypes_podwatch.jar, so that lcm-spy knows them too.
 """
 
 import importlib
@@ -62,10 +63,20 @@ def generate(root: Path) -> None:
         for name in names:
             generated = importlib.import_module(f"lcmtypes.podwatch.{name}")
             (target / f"{name}.pyi").write_text(_stub(name, getattr(generated, name)))
+        _build_jar(source)
     finally:
         sys.path.remove(str(root))
         for name in [key for key in sys.modules if key.split(".")[0] == "lcmtypes"]:
             del sys.modules[name]
+
+
+def _build_jar(source: Path) -> None:
+    """Without the jar everything but lcm-spy works, so a machine without Java is told and no more."""
+    jar = importlib.import_module("lcmtypes.jar")
+    try:
+        jar.build_jar(source)
+    except jar.JarError as error:
+        sys.stderr.write(f"podwatch: no jar for lcm-spy: {error}; later: python -m lcmtypes.jar\n")
 
 
 def _stub(name: str, generated: type) -> str:

@@ -7,7 +7,7 @@ import tempfile
 from pathlib import Path
 from typing import IO, Self
 
-__all__ = ["FIRST_PORT", "N_SLOTS", "Slot", "bus_url", "free_udp_ports", "has_multicast_route"]
+__all__ = ["FIRST_PORT", "N_SLOTS", "Slot", "bus_url", "free_udp_ports", "has_multicast_route", "taken_slots"]
 
 FIRST_PORT = 7667
 N_SLOTS = 50
@@ -38,9 +38,27 @@ class Slot:
         self._file.close()
 
 
+def taken_slots() -> list[int]:
+    """Slots that runs hold now."""
+    taken = []
+    for number in range(N_SLOTS):
+        try:
+            with _lock_path(number).open() as file:
+                fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)  # given back as the file closes
+        except FileNotFoundError:
+            continue
+        except (BlockingIOError, PermissionError):
+            taken.append(number)
+    return taken
+
+
+def _lock_path(number: int) -> Path:
+    return Path(tempfile.gettempdir()) / f"podwatch-slot-{number}.lock"
+
+
 def _lock_lowest() -> tuple[int, IO[str]]:
     for number in range(N_SLOTS):
-        path = Path(tempfile.gettempdir()) / f"podwatch-slot-{number}.lock"
+        path = _lock_path(number)
         try:
             file = os.fdopen(os.open(path, os.O_RDWR | os.O_CREAT, 0o666), "r+")
         except PermissionError:  # another user's

@@ -13,7 +13,7 @@ from logs.reader import LogInfo, info, pictures, read, segments
 from logs.schemas import PACKAGE
 from tools.log.shared import LogPath, app, clear_errors, size_text, warn
 
-__all__ = ["describe"]
+__all__ = ["describe", "describe_value"]
 
 LONGEST_LIST = 8  # items of a list that `cat` prints; the rest is counted
 TABLE_COLUMNS = 100
@@ -66,16 +66,17 @@ def describe(message: Any) -> str:
     """A message's members on one line; bytes that did not decode are shown by number and beginning."""
     if isinstance(message, bytes):
         return f"{len(message)} bytes {message[:LONGEST_RAW].hex(' ')}"
-    return " ".join(f"{name}={_value(getattr(message, name))}" for name in message.__slots__)
+    return " ".join(f"{name}={describe_value(getattr(message, name))}" for name in message.__slots__)
 
 
-def _value(value: Any) -> str:
+def describe_value(value: Any) -> str:
+    """One member's value; long lists are cut and counted."""
     if isinstance(value, bytes):
         return f"<{len(value)} bytes>"
     if isinstance(value, float):
         return f"{value:.6g}"
     if isinstance(value, list | tuple):
-        shown = [_value(item) for item in value[:LONGEST_LIST]]
+        shown = [describe_value(item) for item in value[:LONGEST_LIST]]
         more = len(value) - len(shown)
         return "[" + ", ".join(shown) + (f", +{more} more" if more else "") + "]"
     if hasattr(value, "__slots__"):
