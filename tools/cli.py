@@ -13,6 +13,7 @@ from tools.fly import fly
 from tools.play import play
 from tools.replay import replay_command
 from tools.sim.command import sim
+from tools.spy.command import spy
 
 # What a video reader cannot open, we tell in words of our own.
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
@@ -28,6 +29,7 @@ app.command("sim")(sim)
 app.command("fly")(fly)
 app.command("play")(play)
 app.command("replay")(replay_command)
+app.command("spy")(spy)
 app.add_typer(log.app, name="log")
 app.add_typer(fleet.app, name="fleet")
 app.add_typer(train, name="train")
