@@ -15,6 +15,7 @@ from typing import Any
 
 import lcm
 
+from procs.notify import Notifier
 from procs.runtime import HEARTBEAT_PERIOD_S, Runtime, RuntimeFailure, Subscription, Transport
 from procs.settings import DriverSpec, DroneSettings
 
@@ -67,6 +68,7 @@ class BusRuntime(Runtime):
         self._ready: list[Any] = []
         self._raw: list[tuple[str, bytes]] = []
         self._running = True
+        self._notifier = Notifier()
         self._cpu_s = 0.0
         self._cpu_utime = self._now
         self._wake_read, self._wake_write = os.pipe()
@@ -139,7 +141,12 @@ class BusRuntime(Runtime):
             self._drain()
             self._read_transports()
             self._run_due()
+        self._notifier.stopping()
         self._stop()
+
+    def _beat(self) -> None:
+        super()._beat()
+        self._notifier.beat("; ".join(self._trouble.values()) or "ok")
 
     def _signalled(self, _number: int, _frame: object) -> None:
         self._running = False

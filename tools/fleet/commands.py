@@ -82,3 +82,21 @@ def check(
             f"podwatch: {n_lacking} of {len(findings)} lack something; what mends each is above", err=True
         )
         raise typer.Exit(MISSING)
+
+
+@app.command("units")
+def units(
+    path: FleetFile,
+    drone: Annotated[int, typer.Option(help="Which drone the machine is.", show_default=False)],
+    out: Annotated[Path, typer.Option(help="Folder to write into.")] = Path("units"),
+) -> None:
+    """Write the systemd units of one drone, and the settings that they name."""
+    from tools.fleet.machine import read_fleet
+    from tools.fleet.units import write_units
+
+    with plain_errors():
+        files = write_units(read_fleet(path), drone, out)
+    typer.echo(
+        f"{len(files)} files in {out}. On the drone, once: sudo useradd -r podwatch; then: sudo systemctl "
+        f"link {out.resolve()}/podwatch-{drone}*; sudo systemctl enable --now podwatch-{drone}.target"
+    )

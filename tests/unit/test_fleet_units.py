@@ -1,0 +1,127 @@
+"""The systemd units of a drone: what the process table says, and no right more than each process needs."""
+
+import shutil
+import subprocess
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from procs import processes
+from procs.processes import PROCESSES, Restart
+from procs.relay.keys import make_key
+from procs.settings import DroneSettings
+from tools.fleet import units
+from tools.fleet.machine import read_fleet
+from tools.fleet.template import fleet_text
+
+DRONE = 2
+
+
+class Unit:
+    """One unit file."""
+
+    def __init__(self, path: Path) -> None:
+        self._values: dict[str, list[str]] = {}
+        for line in path.read_text().splitlines():
+            name, equals, value = line.partition("=")
+            if equals:
+                self._values.setdefault(name, []).append(value)
+
+    def get(self, name: str) -> str:
+        """What it says, "" where nothing; joined by spaces where the name stands more than once."""
+        return " ".join(self._values.get(name, []))
+
+
+@pytest.fixture
+def mission(tmp_path: Path) -> Any:
+    path = tmp_path / "fleet.toml"
+    path.write_text(fleet_text("north 100%", "fleet.toml", 3))
+    make_key(tmp_path / "fleet.key")
+    return read_fleet(path)
+
+
+def written(mission: Any, folder: Path) -> dict[str, Unit]:
+    units.write_units(mission, DRONE, folder)
+    return {process.name: Unit(folder / units.unit_name(DRONE, process.name)) for process in PROCESSES}
+
+
+def test_every_process_has_its_unit_and_systemd_finds_nothing_wrong(mission, tmp_path):
+    files = units.write_units(mission, DRONE, tmp_path / "of 1 drone, 100%")
+    named = {path.name for path in files}
+    assert named == {
+        "drone_2.json",
+        "podwatch-2.target",
+        *(f"podwatch-2-{process.name}.service" for process in PROCESSES),
+    }
+    checker = shutil.which("systemd-analyze")
+    if checker is not None:  # where systemd is
+        paths = [str(path) for path in files if path.suffix != ".json"]
+        done = subprocess.run(
+            [checker, "verify", "--man=no", *paths], capture_output=True, text=True, timeout=60
+        )
+        assert (done.returncode, done.stdout + done.stderr) == (0, "")
+
+
+def test_what_a_unit_does_about_what_ends_or_hangs_is_the_tables(mission, tmp_path, monkeypatch):
+    changed = tuple(
+        replace(p, restart_air=Restart.NEVER, heartbeat_limit_s=7.5) if p.name == "camera" else p
+        for p in PROCESSES
+    )
+    monkeypatch.setattr(units, "PROCESSES", changed)
+    for name, unit in written(mission, tmp_path / "units").items():
+        assert unit.get("Restart") == ("no" if name == "camera" else "always")
+        limit_s = processes.BY_NAME[name].heartbeat_limit_s if name != "camera" else 7.5
+        assert float(unit.get("WatchdogSec")) == limit_s
+        assert unit.get("Type") == "notify"
+        assert unit.get("StartLimitIntervalSec") == "0", "in the air nobody gives up"
+
+
+def test_units_stop_in_the_order_of_the_table(mission, tmp_path):
+    """systemd stops a unit before those that it is after."""
+    made = written(mission, tmp_path / "units")
+    for process in PROCESSES:
+        after = made[process.name].get("After").split()
+        later = {p.name for p in PROCESSES if p.stop_order > process.stop_order}
+        assert {name for name in processes.BY_NAME if units.unit_name(DRONE, name) in after} == later
+        assert made[process.name].get("PartOf") == "podwatch-2.target"
+
+
+def test_each_has_only_the_rights_that_it_needs(mission, tmp_path):
+    made = written(mission, tmp_path / "units")
+    for name, unit in made.items():
+        assert unit.get("User") == "podwatch"
+        assert unit.get("NoNewPrivileges") == "yes"
+        assert unit.get("ProtectSystem") == "strict"
+        assert unit.get("CapabilityBoundingSet") == ""
+        assert unit.get("LoadCredential") == (f"fleet.key:{tmp_path}/fleet.key" if name == "relay" else "")
+        assert (unit.get("IPAddressDeny") == "any") == (name != "relay"), "the relay alone leaves the machine"
+        assert unit.get("StateDirectory") == ("podwatch" if name == "logger" else "")
+        devices = {"camera": "/dev/video0 rw", "autopilot": "/dev/ttyAMA0 rw"}.get(name, "")
+        assert unit.get("DeviceAllow") == devices
+        assert unit.get("PrivateDevices") == ("" if devices else "yes")
+
+
+def test_what_the_units_name_is_there_and_holds_no_key(mission, tmp_path):
+    made = written(mission, tmp_path / "units")
+    settings = DroneSettings.read(tmp_path / "units" / "drone_2.json")
+    assert settings.drone_id == DRONE
+    assert settings.mission.radio.key_file == "/run/credentials/podwatch-2-relay.service/fleet.key"
+    key = (tmp_path / "fleet.key").read_text().strip()
+    assert not [path for path in (tmp_path / "units").iterdir() if key in path.read_text()]
+    for name, unit in made.items():
+        assert f" -m procs.main {name} " in unit.get("ExecStart")
+        assert str(tmp_path / "units" / "drone_2.json") in unit.get("ExecStart")
+
+
+def test_an_autopilot_over_the_network_may_use_it_and_no_device(mission, tmp_path):
+    entries = [
+        entry.model_copy(
+            update={"machine": entry.machine.model_copy(update={"autopilot": "udp:0.0.0.0:14550"})}
+        )
+        for entry in mission.drones
+    ]
+    made = written(mission.model_copy(update={"drones": tuple(entries)}), tmp_path / "units")
+    assert made["autopilot"].get("PrivateDevices") == "yes"
+    assert made["autopilot"].get("IPAddressDeny") == ""
