@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from procs.navigator.states import State
 from tools.evidence import DroneLog, Truth, load_run
 from tools.sights import (
     NOBODY,
@@ -37,6 +38,8 @@ END_S = 5.0  # "at the end" is the majority over the last so many seconds
 GRID_S = 0.2  # how often the fleet as a whole is looked at
 DISTINCT_SHARE = 0.9  # of the window
 STRAY_SHARE = 0.05  # of a drone's names may sit on the wrong animal, or on none
+# Who is in one of these has given its animal up.
+GOING_HOME = tuple(state.name for state in (State.RETURN, State.LAND, State.LANDED))
 MIN_NAMINGS = 3  # fewer sights of one identity by one drone decide nothing
 
 
@@ -114,8 +117,12 @@ def judge(truth: Truth, drones: Sequence[DroneLog]) -> Verdict:
 
 
 def _is_assigned(drone: DroneLog) -> bool:
-    """It watched at some time, or its last word was that it has an animal."""
-    return bool(monitor_spans(drone)) or bool(drone.assignments and drone.assignments[-1][1] >= 0)
+    """It watched at some time, or its last word before it went home was that it has an animal."""
+    if monitor_spans(drone):
+        return True
+    out = [t_s for t_s, state in drone.states if state not in GOING_HOME]
+    words = [identity for t_s, identity in drone.assignments if not out or t_s <= out[-1]]
+    return bool(words and words[-1] >= 0)
 
 
 def _is_alive(truth: Truth, drone_id: int, t_s: float) -> bool:

@@ -32,7 +32,8 @@ STATION_TILT_RAD = float(np.radians(5.0))
 STATION_SPEED_M_S = 0.7
 PATIENCE_S = 20.0  # on station alone for so long: register with those who are there
 ASK_AFTER_S = 6.0  # the lowest on station asks first, the others when it does not
-ASSIGN_LIMIT_S = 15.0
+ASSIGN_LIMIT_S = 15.0  # or this, the longer: a ring of 63 that loses 20 % took 19 s
+ASSIGN_LIMIT_A_DRONE_S = 0.4
 GATHER_LIMIT_S = 300.0
 HOLD_LIMIT_S = 15.0
 LEVEL_AT_M = 15.0
@@ -291,7 +292,8 @@ def assign(now: Situation, memory: Memory, camera: Pinhole) -> Step:
             step.event = Event.CERTIFIED
         elif assignment.surplus:
             step.event = Event.SURPLUS
-    if step.event is None and now.in_state_s > ASSIGN_LIMIT_S:
+    limit_s = max(ASSIGN_LIMIT_S, ASSIGN_LIMIT_A_DRONE_S * len(now.mission.roster))
+    if step.event is None and now.in_state_s > limit_s:
         step.event = Event.NOT_CERTIFIED
     return step
 

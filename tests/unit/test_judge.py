@@ -178,6 +178,17 @@ def test_a_drone_that_never_comes_to_monitor_leaves_no_window() -> None:
     assert result.reasons == ("drone 3 had an animal to watch but never came to MONITOR",)
 
 
+def test_a_drone_that_gave_its_animal_up_on_its_way_home_was_to_watch_it_all_the_same() -> None:
+    run = FakeRun()
+    logs = run.logs()
+    states = tuple((t_s, "ASSIGN" if name == "MONITOR" else name) for t_s, name in logs[2].states)
+    home_s = max(t_s for t_s, name in states if name == "ASSIGN")
+    assert any(t_s > home_s for t_s, _ in states), "it goes home"
+    words = [word for word in logs[2].assignments if word[0] <= home_s]
+    logs[2] = dataclasses.replace(logs[2], states=states, assignments=(*words, (home_s + 0.5, -1)))
+    assert judge(run.truth(), logs).distinct is False
+
+
 def test_a_fleet_that_finds_nothing_is_told_how_each_drone_ended() -> None:
     run = FakeRun()
     logs = [dataclasses.replace(log, states=log.states[:10], assignments=(), labels=()) for log in run.logs()]
