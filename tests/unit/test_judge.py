@@ -186,7 +186,7 @@ def test_a_drone_that_gave_its_animal_up_on_its_way_home_was_to_watch_it_all_the
     assert any(t_s > home_s for t_s, _ in states), "it goes home"
     words = [word for word in logs[2].assignments if word[0] <= home_s]
     logs[2] = dataclasses.replace(logs[2], states=states, assignments=(*words, (home_s + 0.5, -1)))
-    assert judge(run.truth(), logs).distinct is False
+    assert judge(run.truth(), logs).reasons == ("drone 3 had an animal to watch but never came to MONITOR",)
 
 
 def test_a_fleet_that_finds_nothing_is_told_how_each_drone_ended() -> None:
