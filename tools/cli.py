@@ -8,6 +8,7 @@ import typer
 
 from tools import fleet, log
 from tools.bench.commands import bench
+from tools.doctor.command import doctor
 from tools.errors import plain_errors, wanted_extra
 from tools.fly import fly
 from tools.play import play
@@ -30,6 +31,7 @@ app.command("fly")(fly)
 app.command("play")(play)
 app.command("replay")(replay_command)
 app.command("spy")(spy)
+app.command("doctor")(doctor)
 app.add_typer(log.app, name="log")
 app.add_typer(fleet.app, name="fleet")
 app.add_typer(train, name="train")

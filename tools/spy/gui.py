@@ -8,10 +8,10 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from lcmtypes.jar import JAR, JAVA_FOLDER, PREFIX
+from tools.doctor.mend import as_root
 
 __all__ = ["GuiError", "start", "what_is_missing"]
 
-NO_JAVA = ("there is no Java", "sudo apt-get install default-jre")
 NO_DISPLAY = ("there is no screen (DISPLAY is not set)", "ssh -X to this machine, or leave --gui out")
 
 
@@ -29,13 +29,13 @@ def what_is_missing(
 ) -> tuple[str, str] | None:
     """(what lcm-spy lacks here, the command that mends it), None where it lacks nothing."""
     if which("java") is None:
-        return NO_JAVA
+        return "there is no Java", as_root("apt-get install default-jre")
     if not library.is_file():
         return f"{library} is not there", f"{sys.executable} -m pip install --force-reinstall lcm==1.5.3"
     if not jar.is_file():
         command = f"{sys.executable} -m lcmtypes.jar"
         if which("javac") is None:
-            command = f"sudo apt-get install default-jdk-headless && {command}"
+            command = f"{as_root('apt-get install default-jdk-headless')} && {command}"
         return f"{jar} is not there: podwatch was installed where there was no Java compiler", command
     if needs_screen and not environment.get("DISPLAY"):
         return NO_DISPLAY
