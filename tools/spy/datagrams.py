@@ -60,7 +60,7 @@ def parse_url(url: str) -> tuple[str, int]:
     except (ValueError, OSError):
         is_group = False
     if not is_group or parts.scheme != "udpm" or not port:
-        raise BusError(f"{url!r} is no bus; write udpm://GROUP:PORT, such as udpm://239.255.76.101:7667")
+        raise ValueError(f"{url!r} is no bus; write udpm://GROUP:PORT, such as udpm://239.255.76.101:7667")
     return group, port
 
 

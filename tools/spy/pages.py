@@ -54,7 +54,7 @@ def ring_page(ring: Ring, cap_bytes_s: int, cap_source: str, now_us: int, width:
     lines.append(Text(""))
     lines.append(Text(f"links: each may send {cap_bytes_s} bytes/s ({cap_source})", style=HEAD))
     columns = f"{'age s':>7}{'loss':>6}{'trip ms':>9}{'bytes/s':>9}{'of cap':>8}{'dropped':>9}{'refused':>9}"
-    lines.append(Text(f" {'link':<8}{'':5}{columns}", style=FAINT))
+    lines.append(Text(f" {'link':<11}{'':5}{columns}", style=FAINT))
     for link in links:
         lines += _link_lines(link, cap_bytes_s)
     if not links:
@@ -127,7 +127,7 @@ def _belief_line(belief: Belief, ids: list[int]) -> Text:
 
 def _link_lines(link: LinkRow, cap_bytes_s: int) -> list[Text]:
     ends = f"{link.drone_id} → {link.peer_id or 'boat'}"
-    line = Text(f" {ends:<8}")
+    line = Text(f" {ends:<11}")
     line.append(f"{'up' if link.is_up else 'down':<5}", style=GOOD if link.is_up else BAD)
     line.append(f"{'never' if link.age_s >= NEVER_S else f'{link.age_s:.1f}':>7}")
     line.append(f"{link.loss:>6.0%}", style=DOUBTFUL if link.loss > HIGH_LOSS else "")
@@ -137,7 +137,7 @@ def _link_lines(link: LinkRow, cap_bytes_s: int) -> list[Text]:
     line.append(f"{load:>8.0%}", style=DOUBTFUL if load > HIGH_LOAD else "")
     line.append(f"{link.n_dropped:>9}{link.n_rejected:>9}")
     kinds = [f"{kind} {n_bytes}" for kind, n_bytes in sorted(link.bytes_s.items()) if n_bytes]
-    return [line, Text(f"{'':14}{', '.join(kinds)}", style=FAINT)] if kinds else [line]
+    return [line, Text(f"{'':17}{', '.join(kinds)}", style=FAINT)] if kinds else [line]
 
 
 def _size(n_bytes: float) -> str:
