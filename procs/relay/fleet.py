@@ -91,17 +91,18 @@ class FleetTable:
         self._entries[self.own_id] = self._entry(row, born_us, now_us)
         self._is_own_said = True
 
-    def order(self, order: Order) -> None:
-        """Take in an order: the newest for its target wins, and a newer one for everybody ends those for
-        one."""
+    def order(self, order: Order) -> bool:
+        """Take in an order -> whether it is news: the newest for its target wins, and a newer one for
+        everybody ends those for one."""
         for target in (order.target, BOAT_ID):
             if target in self._orders and self._orders[target].utime_us >= order.utime_us:
-                return
+                return False
         if order.target == BOAT_ID:
             self._orders = {
                 target: kept for target, kept in self._orders.items() if kept.utime_us > order.utime_us
             }
         self._orders[order.target] = order
+        return True
 
     def order_for(self, drone_id: int, fleet_us: int | None) -> Order:
         """The newest order in force for one drone; NONE where there is none, or where fleet time is not
@@ -141,9 +142,9 @@ class FleetTable:
         entries = [self._entries[self.ids[place]] for place in sorted(chosen)]
         return bitmap + b"".join(with_age(entry.wire, now_us - entry.born_us) for entry in entries) + tail
 
-    def merge(self, peer_id: int, data: bytes, sent_us: int) -> None:
-        """Take in a peer's table, sent at `sent_us`. Raises ValueError where it is not laid out as `pack`
-        does it."""
+    def merge(self, peer_id: int, data: bytes, sent_us: int) -> bool:
+        """Take in a peer's table, sent at `sent_us` -> whether it brings what all should hear at once: an
+        order, a find. Raises ValueError where it is not laid out as `pack` does it."""
         bitmap, rest = int.from_bytes(data[: self._bitmap_bytes], "big"), data[self._bitmap_bytes :]
         if len(data) < self._bitmap_bytes or bitmap >> len(self.ids):
             raise ValueError(
@@ -157,10 +158,19 @@ class FleetTable:
                 rest = rest[used:]
         if not rest or len(rest) != 1 + rest[0] * ORDER.size:
             raise ValueError(f"a fleet table with {len(rest)} bytes where its orders should be")
+        n_finds = self.n_finds
         for member, row, wire, born_us in heard:
             self._hear_row(member, _Entry(row, wire, born_us, peer_id))
-        for utime_us, command, target, animal, expiry_s in ORDER.iter_unpack(rest[1:]):
+        orders = [
             self.order(Order(utime_us, command, target, -1 if animal == NO_ANIMAL else animal, expiry_s))
+            for utime_us, command, target, animal, expiry_s in ORDER.iter_unpack(rest[1:])
+        ]
+        return any(orders) or self.n_finds > n_finds
+
+    @property
+    def n_finds(self) -> int:
+        """How many drones say that a pod was found."""
+        return sum(entry.row.found for entry in self._entries.values())
 
     def has_line(self, living: Sequence[int]) -> bool:
         """Whether a living drone says that a link to its living neighbour is silent."""

@@ -17,7 +17,7 @@ from lcmtypes.podwatch import episode_t, fleet_state_t, link_state_t, mission_st
 from procs.relay import datagram
 from procs.relay.budget import ByteWindow, Message
 from procs.relay.clock_sync import FleetClock
-from procs.relay.fleet import TABLE_LIMIT_BYTES, FleetTable
+from procs.relay.fleet import TABLE_LIMIT_BYTES, FleetTable, Order
 from procs.relay.link import LINK_KIND, Link
 from procs.relay.members import BOAT_ID, Members, Neighbours
 from procs.relay.passing import PASSED_ON, EpisodeRoll
@@ -28,6 +28,7 @@ __all__ = ["DATAGRAM_LIMIT_BYTES", "ENCODED_LIMIT_BYTES", "MAX_MEMBERS", "TICK_S
 
 TICK_S = 0.25
 TICKS_PER_TABLE = 2
+NEWS_TICKS = 4
 TICKS_PER_HELLO = 4
 HELLOS = 4  # lost members called at each such tick, in turn
 ENCODED_LIMIT_BYTES = 400  # of one message as LCM encodes it
@@ -90,6 +91,7 @@ class Relay:
         self.encoded_limit_bytes = min(ENCODED_LIMIT_BYTES, DATAGRAM_LIMIT_BYTES - head)
         self._n_ticks = 0
         self._hello_turn = 0
+        self._n_news_ticks = 0  # for which the table still goes at every tick
 
     def describe(self, mission: mission_state_t, vehicle: vehicle_state_t, now_us: int) -> None:
         """Set this drone's row of the fleet table from its navigator's and autopilot's last words."""
@@ -107,7 +109,15 @@ class Relay:
             is_line=bool(self.silent_sides(now_us)),
             marker=marker,
         )
+        n_finds = self.fleet.n_finds
         self.fleet.say(row, vehicle.utime, now_us)
+        if self.fleet.n_finds > n_finds:
+            self._spread(now_us)
+
+    def order(self, order: Order, now_us: int) -> None:
+        """Give an order to the fleet: what the boat does."""
+        if self.fleet.order(order):
+            self._spread(now_us)
 
     def say(self, channel: Channel, data: bytes, utime: int, payload_bytes: int, now_us: int) -> None:
         """Send a message of the own bus to both neighbours, now or as soon as the cap allows.
@@ -143,7 +153,9 @@ class Relay:
         """Every TICK_S: the relay's own datagrams."""
         living = self.members.living(now_us)
         self.fleet_clock.update(living, {peer_id: link.clock for peer_id, link in self.links.items()}, now_us)
-        has_table = self.fleet.is_windowed or self._n_ticks % TICKS_PER_TABLE == 0
+        has_news = self._n_news_ticks > 0
+        has_table = has_news or self.fleet.is_windowed or self._n_ticks % TICKS_PER_TABLE == 0
+        self._n_news_ticks -= has_news
         spoken_to = self._spoken_to(now_us)
         for peer_id, link in self.links.items():
             if peer_id in spoken_to:
@@ -280,13 +292,23 @@ class Relay:
 
     def _hear(self, link: Link, body: datagram.Body, now_us: int) -> None:
         sent_us = link.sent_here_us(body.stamp_us, now_us)
-        if body.table is not None:
-            self.fleet.merge(link.peer_id, body.table, sent_us)
+        is_news = body.table is not None and self.fleet.merge(link.peer_id, body.table, sent_us)
         self.members.hear(link.peer_id, sent_us, now_us)
         self.members.merge(body.ages, sent_us, now_us)
         link.hear(body, now_us)
         if body.clock is not None:
             self.fleet_clock.hear(link.peer_id, body.clock.offer, now_us)
+        if is_news:
+            self._spread(now_us, link.peer_id)
+
+    def _spread(self, now_us: int, source: int | None = None) -> None:
+        """Pass on an order or a find at once, but not to the peer that brought it, and at every tick of the
+        next second: waiting for a tick at each hop, the far side of a ring would hear it seconds late.
+        """
+        self._n_news_ticks = NEWS_TICKS
+        for peer_id in self._spoken_to(now_us):
+            if peer_id != source and peer_id in self.links:
+                self._send_own(self.links[peer_id], True, now_us)
 
     def _accept(self, link: Link, part: datagram.MessagePart, now_us: int) -> Copy | None:
         """A neighbour's message, if its channel may cross, it decodes as that channel's type and it is
