@@ -17,6 +17,7 @@ from typer.testing import CliRunner
 
 from lcmtypes import channels, make
 from lcmtypes.podwatch import fleet_row_t, fleet_state_t, link_state_t, link_t, preview_t, track_t
+from tools.bench.bus import spy_rows
 from tools.cli import app
 from tools.spy.listener import Listener
 
@@ -153,6 +154,14 @@ def test_what_cannot_be_spied_is_told(url, arguments, code, why):
     result = CliRunner().invoke(app, ["spy", "--url", url, *arguments])
     assert result.exit_code == code
     assert why in " ".join(result.stderr.split()).replace("│ ", "")
+
+
+def test_spying_costs_less_than_a_handler_of_lcm_that_does_nothing():
+    """Of the machine's own measure: `podwatch bench bus` prints the share of a core."""
+    spy, handler, ratio = spy_rows(1.5)
+    assert spy.n > 5000
+    assert handler.n > 5000
+    assert float(ratio.figure or "nan") < 0.9
 
 
 def test_the_screen_is_drawn_and_its_keys_work(url):

@@ -70,6 +70,18 @@ def bench_assignment(
         command(seed, cases, out, quick=quick)
 
 
+@bench.command("bus")
+def bench_bus(
+    out: Annotated[Path, typer.Option(help="Folder for the table.")] = Path("runs/bench"),
+    seconds: Annotated[float, typer.Option(min=1, help="Length of each measurement.")] = 10.0,
+) -> None:
+    """What it costs to spy on a busy bus, beside lcm's own handler."""
+    from tools.bench.bus import command
+
+    with plain_errors():
+        command(out, seconds)
+
+
 @bench.command("logs")
 def bench_logs(
     out: Annotated[Path, typer.Option(help="Folder for the table.")] = Path("runs/bench"),
