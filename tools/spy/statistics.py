@@ -30,7 +30,10 @@ class ChannelStatistics:
         self.last_us = 0
         self.n_lost = 0
         self._window_us = window_us
-        self._recent: deque[tuple[int, int, int]] = deque()  # (arrival us, bytes, us since the one before)
+        # (arrival us, bytes and squared periods up to here): sums over a window are then differences.
+        self._recent: deque[tuple[int, int, int]] = deque()
+        self._before: tuple[int, int, int] | None = None  # the newest that has left the window
+        self._n_bytes = self._squares = 0
         self._fingerprint = fingerprint(self.kind) if self.kind else b""
         self._beats = GapCounter() if self.kind is heartbeat_t else None  # each process counts for itself
         self._last_head = b""  # of the newest message by `seq`
@@ -44,7 +47,10 @@ class ChannelStatistics:
 
     def hear(self, arrived_us: int, n_bytes: int, head: bytes = b"") -> None:
         """One message of so many bytes. `head`: the first of them, as many as name a heartbeat's process."""
-        self._recent.append((arrived_us, n_bytes, arrived_us - self.last_us if self.n_messages else -1))
+        period_us = arrived_us - self.last_us if self.n_messages else 0
+        self._n_bytes += n_bytes
+        self._squares += period_us * period_us
+        self._recent.append((arrived_us, self._n_bytes, self._squares))
         self.n_messages += 1
         self.last_us = arrived_us
         # Almost every message is the next one, and costs no more than this look.
@@ -62,7 +68,7 @@ class ChannelStatistics:
         """Forget what lies before the window that ends now; the number of messages in it."""
         first_us = now_us - self._window_us
         while self._recent and self._recent[0][0] <= first_us:
-            self._recent.popleft()
+            self._before = self._recent.popleft()
         return len(self._recent)
 
     def rate_hz(self, now_us: int, since_us: int) -> float:
@@ -72,19 +78,20 @@ class ChannelStatistics:
     def bytes_s(self, now_us: int, since_us: int) -> float:
         """Bytes of messages a second in the window."""
         self.expire(now_us)
-        return sum(n_bytes for _, n_bytes, _ in self._recent) / self._span_s(now_us, since_us)
+        left = self._before[1] if self._before else 0
+        return (self._n_bytes - left) / self._span_s(now_us, since_us)
 
     def jitter_ms(self, now_us: int) -> float | None:
         """Standard deviation of the times from one message to the next in the window.
 
         None below two such times, and for heartbeats: many processes say them, each at its own instant.
         """
-        self.expire(now_us)
-        periods = [period for _, _, period in self._recent if period >= 0]
-        if len(periods) < 2 or self.kind is heartbeat_t:
+        n_periods = self.expire(now_us) - (self._before is None)
+        if n_periods < 2 or self.kind is heartbeat_t:
             return None
-        total, squares = sum(periods), sum(period * period for period in periods)
-        return math.sqrt(len(periods) * squares - total * total) / len(periods) / 1000
+        first_us, _, left = self._before or self._recent[0]
+        total, squares = self.last_us - first_us, self._squares - left
+        return math.sqrt(n_periods * squares - total * total) / n_periods / 1000
 
     def is_slow(self, now_us: int, since_us: int) -> bool:
         """Whether it says much less than the channel table expects."""
