@@ -1,5 +1,6 @@
 """`podwatch spy` on real buses: what lcm says is what it hears, in the terminal and as text."""
 
+import io
 import os
 import pty
 import select
@@ -13,13 +14,16 @@ from contextlib import contextmanager
 
 import lcm
 import pytest
+from rich.console import Console
 from typer.testing import CliRunner
 
 from lcmtypes import channels, make
 from lcmtypes.podwatch import fleet_row_t, fleet_state_t, link_state_t, link_t, preview_t, track_t
 from tools.bench.bus import spy_rows
 from tools.cli import app
+from tools.spy.command import render
 from tools.spy.listener import Listener
+from tools.spy.session import Session
 
 GROUP = "239.255.76.196"
 DEADLINE_S = 20.0
@@ -136,9 +140,41 @@ def test_the_ring_as_text(url, tmp_path):
     with saying(url):
         text = spied("--url", url, "--text", "--seconds", "0.5", "--page", "ring", "--mission", mission)
     assert "each may send 2400 bytes/s (by slow.toml)" in text
-    assert ["1", "→", "2", "up", "0.0", "0%", "0.0", "600", "25%", "0", "0"] in [
+    assert ["1", "→", "2", "up", "0.0", "0%", "0.0", "600", "25%", "0", "0", "link", "600"] in [
         line.split() for line in text.splitlines()
     ]
+
+
+def drawn(session: Session, page: str, selected: str = "", scrolled: int = 0) -> list[str]:
+    """The lines of a screen of 80 columns and 24 lines."""
+    console = Console(file=io.StringIO(), width=80, height=24, highlight=False)
+    console.print(render(session, page, selected, console, scrolled))
+    return console.file.getvalue().splitlines()
+
+
+def test_a_small_screen_shows_what_it_can_and_says_what_it_leaves_out(url):
+    bus = lcm.LCM(url)
+    with Session(lambda _: url, 1, follows=False) as session:
+        for channel in channels.CHANNELS:
+            bus.publish(channel.name, channel.kind().encode())
+        for drone_id in range(1, 9):
+            links = [make(link_t, peer_id=peer) for peer in range(1, 9)]
+            bus.publish(
+                channels.LINK_STATE, make(link_state_t, drone_id=drone_id, n_links=8, links=links).encode()
+            )
+            session.drain()
+            session.look_round()
+        screen = drawn(session, "channels", channels.TRACK)
+        assert len(screen) == 24
+        assert any(line.startswith(f"›{channels.TRACK} ") for line in screen)
+        assert any("more channels" in line for line in screen)
+        assert any("more members: --text -c shows them" in line for line in screen)
+        assert " state " in " ".join(screen)
+        ring = drawn(session, "ring")
+        assert len(ring) == 24
+        assert "8 → 8" not in "".join(ring)
+        assert "lines 1 to 22 of " in ring[-2]
+        assert "8 → 8" in "".join(drawn(session, "ring", scrolled=1000))
 
 
 @pytest.mark.parametrize(

@@ -28,7 +28,7 @@ from tools.spy.packets import FRAGMENT_HEAD, Fragments
 from tools.spy.pages import ring_page
 from tools.spy.ring import NEVER_S, Ring
 from tools.spy.statistics import BusStatistics, ChannelStatistics
-from tools.spy.values import brief, member_lines
+from tools.spy.values import brief, head_line, member_lines
 
 S = 1_000_000
 
@@ -188,6 +188,12 @@ def test_a_message_is_told_with_the_units_of_its_lcm_file():
     assert lines["n_m"][0] == "1.5"
     assert lines["n_m"][1].startswith("m")
     assert brief(message).startswith("n_m=1.5 ")
+    assert head_line(message) == "utime 1, seq 2, drone_id 3"
+
+
+def test_a_constant_is_told_by_its_name():
+    lines = {name: meaning for name, _, meaning in member_lines(make(track_t, state=track_t.TRACKING))}
+    assert lines["state"] == "TRACKING"
 
 
 def test_bytes_that_are_no_message_are_shown_as_bytes():

@@ -19,7 +19,7 @@ __all__ = ["spy"]
 DRAIN_S = 0.1  # the socket holds what comes between
 REDRAW_S = 1.0
 PAGES = ("channels", "ring")
-FOOT = " ↑ ↓ channel   ← → drone   r ring or channels   q quit"
+FOOT = " ↑ ↓ choose   ← → drone   r ring or channels   q quit"
 UP, DOWN, RIGHT, LEFT = "\x1b[A", "\x1b[B", "\x1b[C", "\x1b[D"
 
 
@@ -124,7 +124,7 @@ def _show(session: "Session", page: str, console: Console) -> None:
 
     from tools.playback.keys import Keys
 
-    selected, draw_at_s = "", 0.0
+    selected, scrolled, draw_at_s = "", 0, 0.0
     try:
         with Keys() as keys, Live(console=console, screen=True, auto_refresh=False) as live:
             while True:
@@ -136,31 +136,38 @@ def _show(session: "Session", page: str, console: Console) -> None:
                     page = PAGES[1 - PAGES.index(page)]
                 elif key in (LEFT, RIGHT):
                     session.step(1 if key == RIGHT else -1)
+                elif key in (UP, DOWN) and page == "ring":
+                    scrolled = max(scrolled + (1 if key == DOWN else -1), 0)
                 elif key in (UP, DOWN):
                     selected = _next_channel(session, selected, 1 if key == DOWN else -1)
                 if key or time.monotonic() >= draw_at_s:
                     draw_at_s = time.monotonic() + REDRAW_S
-                    live.update(render(session, page, selected, console), refresh=True)
+                    live.update(render(session, page, selected, console, scrolled), refresh=True)
     except KeyboardInterrupt:
         return
 
 
-def render(session: "Session", page: str, selected: str, console: Console) -> Group:
-    """The whole screen of this moment."""
+def render(session: "Session", page: str, selected: str, console: Console, scrolled: int = 0) -> Group:
+    """The whole screen of this moment. `scrolled`: lines of a ring that does not fit, above the screen."""
     from rich.text import Text
 
     from tools.spy.listener import now_us
     from tools.spy.pages import channel_page, ring_page
 
     width, height = console.size
+    room = height - 1
     if page == "ring":
         session.look_round()
         lines = ring_page(session.ring, *session.cap(), now_us(), width)
+        n_hidden = len(lines) - room + 1
+        if n_hidden > 1:
+            first = min(scrolled, n_hidden)
+            note = f" lines {first + 1} to {first + room - 1} of {len(lines)}: ↑ ↓ move them"
+            lines = [*lines[first : first + room - 1], Text(note, style="dim")]
     else:
-        lines = channel_page(session.listener, selected, now_us(), width, height - 1)
-    shown = lines[: height - 1]
-    shown += [Text("")] * (height - 1 - len(shown))
-    return Group(*shown, Text(FOOT[:width], style="reverse", no_wrap=True))
+        lines = channel_page(session.listener, selected, now_us(), width, room)
+    lines += [Text("")] * (room - len(lines))
+    return Group(*lines, Text(f"{FOOT:<{width}}"[:width], style="reverse", no_wrap=True))
 
 
 def _key(keys: "Keys") -> str:

@@ -5,13 +5,15 @@ from rich.text import Text
 from tools.spy.listener import Listener
 from tools.spy.ring import NEVER_S, Belief, LinkRow, Ring
 from tools.spy.statistics import BusStatistics, ChannelStatistics
-from tools.spy.values import brief, member_lines
+from tools.spy.values import HEAD as HEAD_MEMBERS
+from tools.spy.values import brief, head_line, member_lines
 
 __all__ = ["channel_page", "ring_page"]
 
 BAD, DOUBTFUL, GOOD, HEAD, FAINT = "bold red", "yellow", "green", "bold", "dim"
 STALE_S = 2.0  # a channel with a nominal rate that is silent for longer stands out
 HIGH_LOSS, HIGH_LOAD = 0.2, 0.8
+WIDE = 110  # columns in which a link's bytes by kind stand beside it
 HEADINGS = (
     f"{'':1}{'channel':<20}{'Hz':>7}{'of':>4}{'jitter':>8}{'bytes/s':>9}{'gaps':>6}{'age s':>7}  newest"
 )
@@ -22,8 +24,9 @@ def channel_page(listener: Listener, selected: str, now_us: int, width: int, hei
     statistics = listener.statistics
     shown = statistics.in_order()
     lines = [_bus_line(listener, now_us), Text(HEADINGS, style=FAINT)]
-    n_rows = max(height - 8, 4)
     names = [channel.name for channel in shown]
+    # A chosen message gets half of the screen where not all fit.
+    n_rows = height - 3 if selected not in names else max(height // 2 - 3, height - 24, 4)
     place = names.index(selected) if selected in names else 0
     first = min(max(0, place - n_rows + 1), max(len(shown) - n_rows, 0))
     for channel in shown[first : first + n_rows]:
@@ -56,7 +59,7 @@ def ring_page(ring: Ring, cap_bytes_s: int, cap_source: str, now_us: int, width:
     columns = f"{'age s':>7}{'loss':>6}{'trip ms':>9}{'bytes/s':>9}{'of cap':>8}{'dropped':>9}{'refused':>9}"
     lines.append(Text(f" {'link':<11}{'':5}{columns}", style=FAINT))
     for link in links:
-        lines += _link_lines(link, cap_bytes_s)
+        lines += _link_lines(link, cap_bytes_s, is_wide=width >= WIDE)
     if not links:
         lines.append(Text(" no LINK_STATE heard", style=DOUBTFUL))
     return [_cut(line, width) for line in lines]
@@ -67,7 +70,7 @@ def _bus_line(listener: Listener, now_us: int) -> Text:
     per_s = sum(c.rate_hz(now_us, statistics.since_us) for c in statistics.channels.values())
     bytes_s = sum(c.bytes_s(now_us, statistics.since_us) for c in statistics.channels.values())
     line = Text(f"{listener.url.partition('?')[0]}  ", style=HEAD)
-    line.append(f"{per_s:.0f} messages/s, {_size(bytes_s)}bytes/s", style="default not bold")
+    line.append(f"{per_s:.0f} messages/s, {_size(bytes_s)}B/s", style="default not bold")
     if listener.n_dropped:
         line.append(f", {listener.n_dropped} missed here (this machine is too busy)", style=BAD)
     return line
@@ -95,13 +98,20 @@ def _channel_line(
 def _message_lines(listener: Listener, channel: ChannelStatistics, n_lines: int) -> list[Text]:
     """The newest message, a member a line."""
     kind = channel.kind.__name__ if channel.kind else "of no type that the channel table knows"
-    lines = [Text(f"{channel.name}  {kind}, {len(channel.data)} bytes", style=HEAD)]
-    members = member_lines(listener.newest(channel.name))
-    widest = max(len(name) for name, _, _ in members)
-    for name, value, meaning in members[: max(n_lines - 1, 0)]:
+    message = listener.newest(channel.name)
+    title = Text(f"{channel.name}  {kind}, {len(channel.data)} bytes", style=HEAD)
+    lines = [title.append(f"  {head_line(message)}", style="not bold dim")]
+    members = [line for line in member_lines(message) if line[0] not in HEAD_MEMBERS]
+    widest = max((len(name) for name, _, _ in members), default=0)
+    n_shown = n_lines - 1 if len(members) < n_lines else n_lines - 2
+    for name, value, meaning in members[: max(n_shown, 0)]:
         line = Text(f" {name:<{widest}}  ", style=FAINT)
         line.append(value, style="default not dim")
         lines.append(line.append(f"  {meaning}") if meaning else line)
+    if n_shown < len(members):
+        lines.append(
+            Text(f" {len(members) - max(n_shown, 0)} more members: --text -c shows them", style=FAINT)
+        )
     return lines
 
 
@@ -125,7 +135,7 @@ def _belief_line(belief: Belief, ids: list[int]) -> Text:
     return line
 
 
-def _link_lines(link: LinkRow, cap_bytes_s: int) -> list[Text]:
+def _link_lines(link: LinkRow, cap_bytes_s: int, *, is_wide: bool) -> list[Text]:
     ends = f"{link.drone_id} → {link.peer_id or 'boat'}"
     line = Text(f" {ends:<11}")
     line.append(f"{'up' if link.is_up else 'down':<5}", style=GOOD if link.is_up else BAD)
@@ -137,7 +147,9 @@ def _link_lines(link: LinkRow, cap_bytes_s: int) -> list[Text]:
     line.append(f"{load:>8.0%}", style=DOUBTFUL if load > HIGH_LOAD else "")
     line.append(f"{link.n_dropped:>9}{link.n_rejected:>9}")
     kinds = [f"{kind} {n_bytes}" for kind, n_bytes in sorted(link.bytes_s.items()) if n_bytes]
-    return [line, Text(f"{'':17}{', '.join(kinds)}", style=FAINT)] if kinds else [line]
+    if is_wide or not kinds:
+        return [line.append(f"  {', '.join(kinds)}", style=FAINT)]
+    return [line, Text(f"{'':17}{', '.join(kinds)}", style=FAINT)]
 
 
 def _size(n_bytes: float) -> str:

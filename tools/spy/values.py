@@ -7,9 +7,10 @@ from typing import Any
 
 from tools.log.inspect import describe, describe_value
 
-__all__ = ["brief", "member_lines"]
+__all__ = ["brief", "head_line", "member_lines"]
 
 HEAD = ("utime", "seq", "drone_id")
+ENUM = "enum below"  # how a .lcm file says that a member's values are its constants
 MEMBER = re.compile(r"^\s*\S+\s+(\w+)(?:\[.*\])*;\s*//\s*(.*)$")
 
 
@@ -27,9 +28,25 @@ def member_lines(message: Any) -> list[tuple[str, str, str]]:
     if isinstance(message, bytes):
         return [("bytes", describe(message), "")]
     meanings = _meanings(type(message).__name__)
-    return [
-        (name, describe_value(getattr(message, name)), meanings.get(name, "")) for name in message.__slots__
-    ]
+    lines = []
+    for name in message.__slots__:
+        value, meaning = getattr(message, name), meanings.get(name, "")
+        if meaning.startswith(ENUM):
+            meaning = _enum_name(message, value)
+        lines.append((name, describe_value(value), meaning))
+    return lines
+
+
+def head_line(message: Any) -> str:
+    """What every message begins with, in words; "" for bytes that did not decode."""
+    parts = [f"{name} {getattr(message, name)}" for name in HEAD if hasattr(message, name)]
+    return ", ".join(parts)
+
+
+def _enum_name(message: Any, value: Any) -> str:
+    """The constants of the type that have this value."""
+    constants = vars(type(message)).items()
+    return " or ".join(name for name, number in constants if name.isupper() and number == value)
 
 
 @cache
