@@ -196,6 +196,13 @@ def test_a_constant_is_told_by_its_name():
     assert lines["state"] == "TRACKING"
 
 
+def test_each_struct_of_a_list_has_a_line():
+    lines = member_lines(link_state(1, make(link_t, peer_id=2), make(link_t, peer_id=3)))
+    told = {name: value for name, value, _ in lines}
+    assert told["links[0]"].startswith("peer_id=2 ")
+    assert told["links[1]"].startswith("peer_id=3 ")
+
+
 def test_bytes_that_are_no_message_are_shown_as_bytes():
     assert decode(track_t, b"\x01\x02nothing") == b"\x01\x02nothing"
     assert decode(None, b"abc") == b"abc"

@@ -25,8 +25,9 @@ def channel_page(listener: Listener, selected: str, now_us: int, width: int, hei
     shown = statistics.in_order()
     lines = [_bus_line(listener, now_us), Text(HEADINGS, style=FAINT)]
     names = [channel.name for channel in shown]
-    # A chosen message gets half of the screen where not all fit.
-    n_rows = height - 3 if selected not in names else max(height // 2 - 3, height - 24, 4)
+    n_rows = height - 3
+    if selected in names:  # where not all fit, a chosen message gets half of the screen
+        n_rows = max(height // 2 - 3, height - 5 - len(member_lines(listener.newest(selected))), 4)
     place = names.index(selected) if selected in names else 0
     first = min(max(0, place - n_rows + 1), max(len(shown) - n_rows, 0))
     for channel in shown[first : first + n_rows]:

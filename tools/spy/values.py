@@ -24,7 +24,10 @@ def brief(message: Any) -> str:
 
 
 def member_lines(message: Any) -> list[tuple[str, str, str]]:
-    """(member, value, unit and meaning) of each member; bytes that did not decode are one line."""
+    """(member, value, unit and meaning) of each member; of a list of structs a line each.
+
+    Bytes that did not decode are one line.
+    """
     if isinstance(message, bytes):
         return [("bytes", describe(message), "")]
     meanings = _meanings(type(message).__name__)
@@ -33,7 +36,10 @@ def member_lines(message: Any) -> list[tuple[str, str, str]]:
         value, meaning = getattr(message, name), meanings.get(name, "")
         if meaning.startswith(ENUM):
             meaning = _enum_name(message, value)
-        lines.append((name, describe_value(value), meaning))
+        if isinstance(value, list | tuple) and value and hasattr(value[0], "__slots__"):
+            lines += [(f"{name}[{k}]", describe(item), "") for k, item in enumerate(value)]
+        else:
+            lines.append((name, describe_value(value), meaning))
     return lines
 
 
