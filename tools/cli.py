@@ -8,6 +8,7 @@ import typer
 
 from tools import fleet, log
 from tools.bench.commands import bench
+from tools.boat.command import boat
 from tools.doctor.command import doctor
 from tools.errors import plain_errors, wanted_extra
 from tools.fly import fly
@@ -28,6 +29,7 @@ app = typer.Typer(
 train = typer.Typer(help="Train the models that ship (needs the `train` extra).", no_args_is_help=True)
 app.command("sim")(sim)
 app.command("fly")(fly)
+app.command("boat")(boat)
 app.command("play")(play)
 app.command("replay")(replay_command)
 app.command("spy")(spy)

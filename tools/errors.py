@@ -21,6 +21,8 @@ EXIT_CODES = {
     ("procs.settings", "MissionError"): UNUSABLE,
     ("logs.exceptions", "LogError"): UNUSABLE,
     ("drivers.sim.render.scene", "SurfaceError"): UNUSABLE,
+    ("tools.boat.orders", "OrderError"): UNUSABLE,
+    ("tools.boat.orders", "BoatError"): FAILED,
     ("tools.evidence", "EvidenceError"): UNUSABLE,
     ("tools.views", "ViewsError"): UNUSABLE,
     ("procs.detector.decode", "ModelError"): MISSING,

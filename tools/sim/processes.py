@@ -19,8 +19,10 @@ from lcmtypes import channels
 from lcmtypes.podwatch import heartbeat_t
 from procs import processes
 from procs.navigator.states import State
-from procs.settings import DriverSpec, DroneSettings
+from procs.relay.members import BOAT_ID
+from procs.settings import BoatSettings, DriverSpec, DroneSettings, MachineSettings, Mission
 from tools.buses import Slot, bus_url, free_udp_ports
+from tools.fleet.text import mission_text
 from tools.heartbeats import HeartbeatGuard, Hung, end_hung
 from tools.sim.plan import RunPlan
 from tools.sim.watch import Watch
@@ -52,10 +54,11 @@ class ProcessFleet:
         _remove(prefix)
         self._run = f"s{self._slot.number}x{secrets.token_hex(4)}"
         roster = plan.mission.roster
-        ports = free_udp_ports(3 * len(roster))
-        self._mavlink_ports = dict(zip(roster, ports, strict=False))
-        self._radio_ports = dict(zip(roster, ports[len(roster) :], strict=False))
-        self._ether_ports = dict(zip(roster, ports[2 * len(roster) :], strict=False))
+        sailing = (BOAT_ID, *roster)  # the boat has a radio too, for whoever sails one
+        ports = free_udp_ports(3 * len(sailing))
+        self._mavlink_ports = dict(zip(roster, ports[: len(roster)], strict=True))
+        self._radio_ports = dict(zip(sailing, ports[len(roster) :], strict=False))
+        self._ether_ports = dict(zip(sailing, ports[len(roster) + len(sailing) :], strict=False))
         self._heard: set[str] = set()
         self._guard = HeartbeatGuard()
         self._world = lcm.LCM(world_url(self._slot.number))
@@ -160,6 +163,20 @@ class ProcessFleet:
         for drone_id in self.plan.mission.roster:
             path = output / f"drone_{drone_id}.json"
             path.write_text(self._drone_settings(drone_id).model_dump_json(indent=1))
+        (self.plan.folder / "boat.toml").write_text(mission_text(self._boat_mission()))
+
+    def _boat_mission(self) -> Mission:
+        """The fleet file with which `podwatch boat` joins this run: it flies by the simulation's clock."""
+        mission = self.plan.plain_mission
+        drones = [
+            entry.model_copy(
+                update={"machine": MachineSettings(radio=f"127.0.0.1:{self._ether_ports[entry.id]}")}
+            )
+            for entry in mission.drones
+        ]
+        clock = DriverSpec(driver="drivers.sim.clock:SimClock", options={"page": str(self._page_path)})
+        boat = BoatSettings(radio=f"127.0.0.1:{self._radio_ports[BOAT_ID]}", drivers={"clock": clock})
+        return mission.model_copy(update={"drones": tuple(drones), "boat": boat})
 
     def _world_settings(self) -> dict[str, Any]:
         plan = self.plan
@@ -196,7 +213,7 @@ class ProcessFleet:
         mission, camera = self.plan.mission, self.plan.mission.camera
         clock = self.plan.clock(drone_id)
         page = str(self._page_path)
-        peers = [peer for peer in mission.roster if peer != drone_id]
+        peers = [peer for peer in (BOAT_ID, *mission.roster) if peer != drone_id]
         return {
             "clock": (
                 "drivers.sim.clock:SimClock",

@@ -1,0 +1,130 @@
+"""The boat's end of the radio: a relay like any other, and the orders that it gives."""
+
+from dataclasses import dataclass
+from typing import Any
+
+from lcmtypes.podwatch import fleet_row_t, fleet_state_t, link_t, operator_t
+from procs.navigator.states import State
+from procs.relay.fleet import Order
+from procs.relay.members import BOAT_ID
+from procs.relay.relay import Relay
+from procs.settings import Mission
+from tools.boat.orders import BoatError, Spoken
+
+__all__ = ["Boat", "Given"]
+
+S = 1_000_000
+# How long an order holds, s. One to hold outlasts a lost boat, not the day.
+EXPIRY_S = {
+    operator_t.START: 30,
+    operator_t.HOLD: 1800,
+    operator_t.RETURN: 60,
+    operator_t.LAND: 60,
+    operator_t.LEAVE: 30,
+}
+ON_GROUND = (State.IDLE, State.LANDED)
+
+
+@dataclass(frozen=True)
+class Given:
+    """An order that was given, and when by the boat's clock."""
+
+    spoken: Spoken
+    order: Order
+    at_us: int
+
+
+class Boat:
+    """Roster member 0. All times in us of the boat's own clock."""
+
+    def __init__(self, mission: Mission, fleet_key: bytes, radio: Any, now_us: int) -> None:
+        """radio: with the interface of `drivers.radios.udp.UdpRadio`. Raises ValueError where it has no
+        address of a drone.
+        """
+        self.mission = mission
+        self.given: list[Given] = []
+        self._radio = radio
+        self._relay = Relay(
+            own_id=BOAT_ID,
+            roster=mission.roster,
+            fleet_key=fleet_key,
+            session=radio.session_id(),
+            send=radio.send,
+            reachable=radio.peers,
+            bytes_per_s=mission.radio.bytes_per_s,
+            lost_after_s=mission.radio.lost_after_s,
+            now_us=now_us,
+        )
+
+    def hear(self, now_us: int) -> None:
+        """Take in all that waits on the radio."""
+        for datagram in self._radio.receive():
+            self._relay.receive(datagram, now_us)
+
+    def tick(self, now_us: int) -> None:
+        """Every `procs.relay.relay.TICK_S`."""
+        self._relay.tick(now_us)
+
+    def state(self, now_us: int) -> fleet_state_t:
+        """The fleet as the boat knows it."""
+        return self._relay.fleet_state(now_us)
+
+    def rows(self, now_us: int) -> dict[int, fleet_row_t]:
+        """The drones that were ever heard of, by id."""
+        return {row.id: row for row in self.state(now_us).rows if row.id != BOAT_ID}
+
+    def links(self, now_us: int) -> list[link_t]:
+        """The boat's own links to drones; begins a new second of counting their bytes."""
+        return list(self._relay.link_state(now_us).links)
+
+    def is_linked(self, now_us: int) -> bool:
+        """Whether some drone hears the boat and the fleet's time is known: orders can be given."""
+        is_heard = any(link.is_up(now_us) for link in self._relay.links.values())
+        return is_heard and bool(self.state(now_us).fleet_time_ok)
+
+    def say(self, spoken: Spoken, now_us: int) -> Given:
+        """Give an order to the fleet. Raises BoatError where it can reach nobody."""
+        state = self.state(now_us)
+        if not self.is_linked(now_us):
+            raise BoatError("no drone hears the boat yet: an order would reach nobody; wait for the link")
+        fleet_us = now_us + int(state.fleet_offset_us)
+        order = Order(fleet_us, spoken.command, spoken.target, spoken.animal, EXPIRY_S[spoken.command])
+        standing = self._standing(fleet_us) if spoken.command == operator_t.LEAVE else []
+        self._relay.order(order, now_us)
+        self.given.append(Given(spoken, order, now_us))
+        for kept in standing:  # one for everybody ends those for one: these hold on
+            again = Order(fleet_us + 1, kept.command, kept.target, -1, kept.expiry_s)
+            self._relay.order(again, now_us)
+        return self.given[-1]
+
+    def left_to_obey(self, given: Given, now_us: int) -> list[int]:
+        """Living drones that do not yet do what they were told."""
+        rows = self.rows(now_us)
+        told = [given.spoken.target] if given.spoken.target else list(rows)
+        living = [rows[drone_id] for drone_id in told if drone_id in rows and rows[drone_id].alive]
+        return [row.id for row in living if not _obeys(given.spoken, row)]
+
+    def _standing(self, fleet_us: int) -> list[Order]:
+        """Orders for one drone alone that are in force and not taken back since."""
+        newest: dict[int, Order] = {}
+        for given in self.given:
+            if given.spoken.command == operator_t.LEAVE:
+                continue
+            if given.spoken.target == 0:
+                newest.clear()
+            else:
+                newest[given.spoken.target] = given.order
+        return [order for order in newest.values() if order.is_valid(fleet_us)]
+
+
+def _obeys(spoken: Spoken, row: fleet_row_t) -> bool:
+    state = State(row.state)
+    if spoken.command == operator_t.START:
+        return state not in (*ON_GROUND, State.HOLD)
+    if spoken.command == operator_t.HOLD:
+        return state in (State.HOLD, *ON_GROUND)
+    if spoken.command == operator_t.LEAVE:
+        return int(row.animal) != spoken.animal
+    if spoken.command == operator_t.LAND:
+        return state in (State.LAND, *ON_GROUND)
+    return state in (State.RETURN, State.LAND, *ON_GROUND)
