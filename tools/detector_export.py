@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import onnx
-import onnxruntime
 import torch
 
+from procs.detector.yolo import open_session
 from tools.detector_model import STRIDES, Exported, WhaleDetector
 
 __all__ = ["check_export", "export"]
@@ -56,7 +56,7 @@ def export(network: WhaleDetector, path: Path, side: int) -> Path:
 
 def check_export(network: WhaleDetector, path: Path, side: int) -> str:
     """One line on how well onnxruntime and torch agree; ValueError when they do not."""
-    session = onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+    session = open_session(path)
     images = np.random.default_rng(0).random((1, 3, side, side), np.float32)
     (found,) = session.run(None, {"images": images})
     with torch.no_grad():

@@ -21,7 +21,7 @@ import models
 from procs.detector.decode import Candidates, ModelError, decode_finished, decode_raw, layout_of, suppress
 from procs.detector.tiles import drop_cut, tile_windows
 
-__all__ = ["Detections", "Detector", "ModelError"]
+__all__ = ["Detections", "Detector", "ModelError", "open_session"]
 
 Image = NDArray[np.uint8]
 
@@ -72,7 +72,7 @@ class Detector:
             raise ValueError(f"tile {tile!r}: must be None, 'auto' or at least 32 px")
         self._path = _model_file(model_path)
         self._confidence, self._iou, self._tile = confidence, iou, tile
-        self._session = _session(self._path)
+        self._session = open_session(self._path)
         self._metadata = dict(self._session.get_modelmeta().custom_metadata_map)
         self._task = self._metadata.get("task", "detect")
         if self._task not in ("detect", "obb"):
@@ -237,7 +237,8 @@ def _model_file(model_path: str | Path | None) -> Path:
     return path
 
 
-def _session(path: Path) -> onnxruntime.InferenceSession:
+def open_session(path: Path) -> onnxruntime.InferenceSession:
+    """A model file, to run on one thread of the processor. Raises ModelError."""
     if path.stat().st_size == 0:
         raise ModelError(f"{path}: the model file is empty; copy or export it again")
     options = onnxruntime.SessionOptions()

@@ -3,6 +3,9 @@ by name.
 """
 
 import hashlib
+import os
+import subprocess
+import sys
 from itertools import pairwise
 from pathlib import Path
 
@@ -308,3 +311,15 @@ def test_the_shipped_model_is_small_and_says_what_it_is() -> None:
 def test_the_model_card_is_about_the_file_that_ships() -> None:
     digest = hashlib.sha256(models.path("detector.onnx").read_bytes()).hexdigest()
     assert digest in models.path("detector.md").read_text()
+
+
+def test_the_library_under_it_keeps_and_sends_no_word_of_the_drone(tmp_path: Path) -> None:
+    """onnxruntime would write a device's number into the home folder and call its maker."""
+    environment = {name: value for name, value in os.environ.items() if not name.startswith(("ORT_", "XDG_"))}
+    subprocess.run(
+        [sys.executable, "-c", "from procs.detector.yolo import Detector; Detector()"],
+        env=environment | {"HOME": str(tmp_path)},
+        cwd=Path(__file__).parents[2],
+        check=True,
+    )
+    assert list(tmp_path.rglob("*")) == []

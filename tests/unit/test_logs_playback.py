@@ -163,6 +163,15 @@ def test_keys_come_from_a_terminal_and_leave_it_as_it_was():
     os.close(slave)
 
 
+def test_a_terminal_that_is_closed_ends_what_reads_its_keys():
+    master, slave = os.openpty()
+    with Keys(slave) as keys:
+        os.close(master)
+        with pytest.raises(KeyboardInterrupt):
+            keys.wait(5.0)
+    os.close(slave)
+
+
 # Pictures.
 
 

@@ -38,9 +38,19 @@ class Keys:
             termios.tcsetattr(self._descriptor, termios.TCSADRAIN, self._kept)  # type: ignore[arg-type]
 
     def wait(self, seconds: float) -> str:
-        """The next key within `seconds`, "" where none is pressed."""
+        """The next key within `seconds`, "" where none is pressed.
+
+        A terminal that was closed is the end of the program, as Ctrl-C: KeyboardInterrupt.
+        """
         sources = [] if self._descriptor is None else [self._descriptor]
         ready, _, _ = select.select(sources, [], [], max(seconds, 0.0))
         if not ready or self._descriptor is None:
             return ""
-        return os.read(self._descriptor, 1).decode("latin-1")
+        try:
+            key = os.read(self._descriptor, 1).decode("latin-1")
+        except OSError:
+            key = ""
+        if not key:
+            self._kept = None  # there is nothing to give back
+            raise KeyboardInterrupt
+        return key
