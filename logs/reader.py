@@ -65,7 +65,7 @@ def read(
     of an unknown fingerprint, or that does not decode, comes as its raw bytes with one LogWarning a channel;
     damage and a log that was never closed get a LogWarning each. `strict` raises LogError in place of any.
 
-    Raises LogError, at the call: the file is missing, unreadable, empty or no MCAP file. (DESIGN section 7.)
+    Raises LogError, at the call: the file is missing, unreadable, empty or no MCAP file. (docs/logs.md.)
     """
     report = _raise if strict else _warn
     wanted = None if channels is None else {channels} if isinstance(channels, str) else set(channels)
@@ -203,7 +203,7 @@ class _Decoder:
 def _kind(raw: RawMessage) -> type[Any] | None:
     """The type with the message's fingerprint: the one that the log names, else the channel table's.
 
-    Not any type with that fingerprint: two structs with the same members share one (DESIGN section 2, 5).
+    Not any type with that fingerprint: two structs with the same members share one (docs/logs.md, 5).
     """
     named = getattr(podwatch, raw.type_name.removeprefix(f"{PACKAGE}."), None)
     for kind in (named, table.kind_of(raw.channel)):

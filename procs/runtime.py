@@ -3,7 +3,7 @@
 A shell is a module with `setup(runtime)`. It registers handlers with `on` and `every` and says messages with
 `publish`; it never loops, sleeps, reads a clock, opens a socket or starts a thread. Two executors drive it:
 `procs.bus_executor` (a select loop on a real bus) and `procs.queue_executor` (a queue in virtual time). Queue
-capacity, newest- only and gap counting are done here, the same in both (DESIGN section 2: LCM's own full
+capacity, newest- only and gap counting are done here, the same in both (docs/architecture.md: LCM's own full
 queue drops the *newest* message).
 """
 

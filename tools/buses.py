@@ -14,7 +14,7 @@ N_SLOTS = 50
 
 
 def bus_url(drone_id: int, slot: int) -> str:
-    """A drone's own multicast group (DESIGN section 2)."""
+    """A drone's own multicast group (docs/architecture.md)."""
     return f"udpm://239.255.76.{100 + drone_id}:{FIRST_PORT + slot}?ttl=0&recv_buf_size=4194304"
 
 

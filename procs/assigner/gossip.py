@@ -1,5 +1,5 @@
-"""The exchange by which a ring agrees who takes which animal, and knows that it has agreed (DESIGN section
-4).
+"""The exchange by which a ring agrees who takes which animal, and knows that it has agreed
+(docs/assignment.md).
 
 Every packet is whole state: which rows, choices, confirmations and releases the sender holds, all choices,
 and a window of rows that goes round. Losing, repeating or reordering packets costs time and nothing else.

@@ -1,4 +1,4 @@
-"""What travels in RING_ASSIGN: one member's whole state as bytes (DESIGN section 4).
+"""What travels in RING_ASSIGN: one member's whole state as bytes (docs/assignment.md).
 
 Packet: version, sender, n_members (1 byte each); four bitmaps by member index (rows, choices, confirmed,
 released), lowest bit first; 1 byte an animal id for each choice held, 255 for none; the number of messages

@@ -106,7 +106,7 @@ def assign(
 
     "gnn": `rounds` rounds of learned messages; two agents may still choose the same. "gnn+resolve": learned
     rounds, then flooded lists of each agent's three likeliest goals, solved by all alike. "exact": every
-    agent's row of 16-bit costs floods the ring in floor(n/2) rounds (DESIGN section 7), whatever `rounds`
+    agent's row of 16-bit costs floods the ring in floor(n/2) rounds (docs/assignment.md), whatever `rounds`
     says; with `loss`, the share of messages that never arrive, whole tables travel for
     floor(n/2) + max(3, n/4) rounds, and an agent whose table stays incomplete holds (-1). More agents than
     goals: the rest get -1. Messages are lost by a generator seeded with `seed`; `training_seed` picks the

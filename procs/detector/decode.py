@@ -1,6 +1,4 @@
-"""From a detection network's output to boxes: the layouts that exported ONNX files come in (DESIGN section
-7).
-"""
+"""From a detection network's output to boxes: the layouts of exported ONNX files (docs/detector.md)."""
 
 from collections.abc import Sequence
 from typing import Literal, NamedTuple

@@ -10,9 +10,8 @@ __all__ = ["circle_radius", "gather_height", "layer_heights", "separate", "slot"
 Array = NDArray[np.float64]
 
 N_LAYERS = 3
-LAYER_SPAN = (
-    0.15  # share of the height within which the layers lie (DESIGN section 5): boxes of all drones stay alike
-)
+# Share of the height within which the layers lie (docs/navigator.md): boxes of all drones stay alike.
+LAYER_SPAN = 0.15
 TILT_MARGIN_RAD = np.radians(5.0)
 BARRIER_PER_S = 0.7  # how fast a drone may use up the distance that it has left
 # A report is carried forward by its velocity for so long at most; then its drone may have turned, or stand.
@@ -35,7 +34,7 @@ def gather_height(
     tilt_margin_rad: float = float(TILT_MARGIN_RAD),
 ) -> float:
     """Height from which every drone of the circle sees the whole pod, clamped to [lowest_m, highest_m]
-    (DESIGN section 5).
+    (docs/navigator.md).
 
     The lowest of the circle's layers stands here; the others stand at most 15 % above it, and none above
     highest_m.

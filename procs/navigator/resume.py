@@ -1,4 +1,4 @@
-"""On again after a restart in flight or after a HOLD (DESIGN section 5: on start in the air the navigator
+"""On again after a restart in flight or after a HOLD (docs/navigator.md: on start in the air the navigator
 holds first).
 """
 

@@ -1,4 +1,4 @@
-"""Box-ICP: which box of one view is which box of another (paper, Algorithm 1; DESIGN section 7).
+"""Box-ICP: which box of one view is which box of another (paper, Algorithm 1; docs/registration.md).
 
 `mode="literal"` is the algorithm as printed. `mode="robust"`, the default, holds at any relative heading,
 with misses, false alarms, tilt and partly overlapping views: hypotheses from pairs of boxes, one coarse

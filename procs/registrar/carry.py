@@ -1,7 +1,7 @@
 """From the episode's instant to now: the same animal's box from frame to frame, on the ground.
 
 Boxes are followed as points in the drone's own NED frame, so that its own motion drops out. An id given to a
-box of an earlier frame (DESIGN section 4, "from t to now") is then the id of that animal's box in the newest
+box of an earlier frame (docs/registration.md) is then the id of that animal's box in the newest
 frame.
 """
 

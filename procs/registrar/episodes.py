@@ -1,4 +1,4 @@
-"""Who registers with whom, and when: proposals of episodes (DESIGN section 4, "An episode").
+"""Who registers with whom, and when: proposals of episodes (docs/registration.md).
 
 Any drone may propose one; the larger (number, proposer) wins everywhere, so that all end with the same.
 Proposals are said again and again as whole state; a member list never changes within a number.

@@ -1,7 +1,7 @@
 """The fleet's map of animals: what travels the ring in 9 bytes an animal, and what is remembered between
 episodes.
 
-A packet is a header of 16 bytes and 9 bytes an animal (paper, Communication Bandwidth; DESIGN section 4),
+A packet is a header of 16 bytes and 9 bytes an animal (paper, Communication Bandwidth; docs/registration.md),
 big endian:
 
     header  version B, episode H, proposer B, lap B, rank B, flags B, confidence B (in 255ths), origin north
@@ -42,7 +42,7 @@ MAX_ANIMALS = 32  # 304 bytes: beyond the paper's 20, and still within its 308
 REACH_M = 327.0  # int16 centimetres
 MAX_SIZE_M = 163.83  # 14 bits of centimetres
 COUNTER_LIMIT = 15
-REUSE_AFTER_S = 600.0  # an id is given to another animal only after this long unseen (DESIGN section 4)
+REUSE_AFTER_S = 600.0  # an id is given to another animal only after this long unseen (docs/registration.md)
 
 
 class PacketError(ValueError):

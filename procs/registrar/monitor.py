@@ -1,4 +1,4 @@
-"""MONITOR: which animal of the map is in each box, by the drone's own pose (DESIGN section 4).
+"""MONITOR: which animal of the map is in each box, by the drone's own pose (docs/registration.md).
 
 Each camera then stands over its own animal and sees few others, so that views can no longer be laid on
 each other. The map can: a drone knows about where it is and which way it looks, and the boxes do the rest.

@@ -27,7 +27,7 @@ __all__ = ["UPKEEP", "Finished", "Registrar", "RingPacket"]
 Array = NDArray[np.float64]
 
 # A frame further from the instant t is no view of it. At 5 Hz t may lie 100 ms from both frames beside it: a
-# limit of just that (DESIGN section 4) made a drone blind by a hair, and in every episode again.
+# limit of just that (docs/registration.md) made a drone blind by a hair, and in every episode again.
 NEAREST_FRAME_US = 200_000
 DETECTED_AFTER_US = 450_000  # by then the detector has said what it found at t
 SECOND_LOOK_US = 1_200_000  # a pair's second instant, at least 1 s after the first
@@ -322,7 +322,7 @@ class Registrar:
         return entry.seen_fleet_utime if entry is not None else 0
 
     def _take_up(self, sighting: Sighting, pose: Pose, fleet_utime: int) -> None:
-        """Name boxes that have no name by the map, with this drone's pose as prior (DESIGN section 4,
+        """Name boxes that have no name by the map, with this drone's pose as prior (docs/registration.md,
         MONITOR); only what several sights running agree on.
         """
         fresh = [

@@ -1,5 +1,5 @@
-"""The ring's registration: a map of the animals goes round, each drone matches its boxes to it (DESIGN
-section 4).
+"""The ring's registration: a map of the animals goes round, each drone matches its boxes to it
+(docs/registration.md).
 
 Each node repeats the newest map that it knows, by (done, lap, rank); the node whose turn comes next after
 that map acts on it, wherever the packet came from. So lost, repeated and late packets cost time and nothing

@@ -1,4 +1,4 @@
-"""Clock offsets of the links and one fleet time for all (DESIGN section 4, Fleet state).
+"""Clock offsets of the links and one fleet time for all (docs/relay.md, Fleet state).
 
 Each link is measured with four timestamps as in NTP (RFC 5905, section 8): of the recent exchanges the one
 with the least round trip says the offset, since queues only ever add to it. Fleet time is the clock of the

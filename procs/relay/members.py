@@ -1,4 +1,4 @@
-"""Who of the roster lives, and who is next to whom on the ring (DESIGN section 4, Members).
+"""Who of the roster lives, and who is next to whom on the ring (docs/relay.md, Members).
 
 Every datagram carries its sender's table of last-heard ages, one byte a member, merged here by minimum.
 Ages travel as ages and never as instants, since the drones' clocks differ; each is rounded up, so passing

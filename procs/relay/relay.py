@@ -1,5 +1,5 @@
-"""The relay's core: everything that crosses between drones, with time and datagrams as arguments (DESIGN
-section 4).
+"""The relay's core: everything that crosses between drones, with time and datagrams as arguments
+(docs/relay.md).
 
 It speaks to its living ring neighbours, to the boat while it hears it, and once a second to a few of the
 lost, so that partitions meet again. `tick` sends each neighbour the link's part (ages, clocks) and every

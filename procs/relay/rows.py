@@ -1,4 +1,4 @@
-"""One row of the fleet table on the wire: 15 bytes, 22 with a marker (DESIGN section 4, Fleet state).
+"""One row of the fleet table on the wire: 15 bytes, 22 with a marker (docs/relay.md, Fleet state).
 
     bits       1 byte    mission state (5 bits), found, on station, wants an episode
     bits       1 byte    battery (6 bits, 0-63), its ring is a line, coarse

@@ -1,5 +1,4 @@
-"""Authenticated datagrams: who sent it, unaltered, once, and in this life of both relays (DESIGN section
-4).
+"""Authenticated datagrams: who sent it, unaltered, once, and in this life of both relays (docs/relay.md).
 
 On the wire: version, sender, session and counter in clear (14 bytes), then ChaCha20-Poly1305 (RFC 8439)
 over one byte of flags, a challenge and an echo where they are due, and the body; 16 bytes of tag. The
