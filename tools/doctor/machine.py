@@ -28,7 +28,7 @@ __all__ = [
     "check_slots",
 ]
 
-RECEIVE_BYTES = 4194304  # what every bus asks for: with less, long messages are lost (docs/architecture.md)
+RECEIVE_BYTES = 4194304  # every bus asks for it: with less, long messages are lost (docs/architecture.md)
 GROUP = "239.255.76.100"  # no drone's: ids begin at 1
 HEAR_S = 0.5
 LOOPBACK = "127."
