@@ -89,7 +89,8 @@ def standby(now: Situation, memory: Memory, camera: Pinhole) -> Step:
     if memory.surplus and memory.find is not None:
         step = fly_to(now, surplus_place(now, memory.find, camera), now.mission.watch.speed_m_s)
         step.wants_episode = surplus.asks(now, memory)
-        if assignment is not None and assignment.certified and assignment.animal >= 0:
+        is_new = assignment is not None and episode_key(assignment) > memory.assigned_key
+        if assignment is not None and is_new and assignment.certified and assignment.animal >= 0:
             memory.animal, memory.assigned_key = assignment.animal, episode_key(assignment)
             step.event = Event.CERTIFIED
         return step

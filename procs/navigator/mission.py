@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from drivers.cameras.pinhole import Pinhole
 from lcmtypes import make, podwatch
 from procs.history import camera_of
-from procs.navigator import behaviours, finds, resume
+from procs.navigator import behaviours, finds, resume, surplus
 from procs.navigator.decisions import overriding_events
 from procs.navigator.flight import limited
 from procs.navigator.formation import separate
@@ -99,6 +99,7 @@ class Navigator:
         finds.sense(now, self.memory, self.camera)
         finds.share(now, self.memory, self.camera)
         finds.keep_clock(now, self.memory)
+        surplus.note_left(now, self.memory)
         self._decide(now)
         step = BEHAVIOURS[self.memory.state](now, self.memory, self.camera)
         setpoint = self._setpoint(now, step)
@@ -153,7 +154,7 @@ class Navigator:
             memory.seen_us = inputs.utime
             memory.surplus = False
         elif target == State.STANDBY:
-            memory.surplus = event is Event.SURPLUS or memory.surplus
+            memory.surplus = event in (Event.SURPLUS, Event.LEAVE) or memory.surplus
             memory.animal = -1
         elif target == State.ASSIGN:
             memory.lost_animal = -1

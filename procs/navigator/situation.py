@@ -119,6 +119,7 @@ class Memory:
     free_animals: tuple[int, ...] = ()  # those
     free_key: EpisodeKey = (0, 0)  # newest episode that had ended when they were looked at last
     n_asked: int = 0  # episodes that have ended and left them to nobody
+    left: tuple[int, ...] = ()  # animals that any drone was ordered to leave
     held_us: int = 0  # last instant of doubt
     pilot_us: int = 0  # last instant at which the pilot had it
     watch_seen: bool = False  # it has seen the fleet watch, at any time
@@ -130,7 +131,7 @@ class Memory:
 
 
 def episode_key(message: podwatch.identities_t | podwatch.assignment_t | None) -> EpisodeKey:
-    """(number, proposer) of the newest ended episode; the larger is the newer (DESIGN section 4)."""
+    """(number, proposer) of the newest ended episode; the larger is the newer (docs/navigator.md)."""
     if message is None:
         return (0, 0)
     if isinstance(message, podwatch.identities_t):

@@ -1,4 +1,4 @@
-"""The mission's states and the one table of the steps between them (DESIGN section 5).
+"""The mission's states and the one table of the steps between them (docs/navigator.md).
 
 The navigator can change state only through `next_state`, and docs/navigator.md draws `diagram()`: a test
 compares the two.
@@ -121,7 +121,7 @@ RULES = (
     Rule((S.ASSIGN, S.MONITOR), E.SURPLUS, S.STANDBY),
     Rule((S.MONITOR,), E.ANIMAL_LOST, S.RENDEZVOUS),
     Rule((S.MONITOR,), E.CONFLICT, S.RENDEZVOUS),
-    Rule((S.MONITOR,), E.LEAVE, S.RENDEZVOUS),
+    Rule((S.MONITOR,), E.LEAVE, S.STANDBY),
     Rule((S.STANDBY, *GATHERED, S.MONITOR), E.WATCHED, S.RETURN),
     Rule((S.STANDBY, *GATHERED, S.MONITOR), E.FLEET_RETURNS, S.RETURN),
     Rule(GATHERED, E.STUCK, S.RETURN),
