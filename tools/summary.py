@@ -115,6 +115,11 @@ def print_summary(summary: Summary, console: Console) -> None:
             highlight=False,
         )
     console.print(_drone_table(summary))
+    console.print(
+        "  its animal: as the fleet calls it; truly: that animal's number in truth.csv\n",
+        highlight=False,
+        style="dim",
+    )
     if summary["links"]:
         console.print(_link_table(summary))
     console.print(_footer(summary), highlight=False, markup=False, style="dim")
@@ -203,12 +208,23 @@ def _largest(sizes: dict[str, dict[str, int]], what: str) -> int:
 
 def _drone_table(summary: Summary) -> Table:
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
-    for title in ("drone", "animal", "watched", "in the picture", "ended in", "tracker", "command age p99"):
+    titles = (
+        "drone",
+        "its animal",
+        "truly",
+        "watched",
+        "in picture",
+        "ended in",
+        "tracker",
+        "command age p99",
+    )
+    for title in titles:
         table.add_column(title, justify="left" if title in ("drone", "ended in") else "right")
     for drone in summary["drones"]:
         animal = drone["animal"]
         table.add_row(
             str(drone["id"]),
+            "-" if drone["identity"] is None or drone["identity"] < 0 else str(drone["identity"]),
             "-" if animal is None else str(animal),
             f"{drone['monitor_s']:.0f} s" if drone["monitor_s"] else "-",
             _shown(drone["in_image_share"], "{:.1%}"),

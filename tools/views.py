@@ -244,8 +244,11 @@ def _told(agreement: Agreement) -> str:
         len({int(i) for ids in agreement.identities for i in ids if i >= 0}),
     )
     agreed = "agree" if agreement.consensus else "do NOT agree for certain"
+    count = "1 animal" if n_animals == 1 else f"{n_animals} animals"
+    if agreement.consensus and max(len(boxes) for boxes in agreement.boxes) == 1:
+        count += ", though one box in each view fits whatever animal it is"
     taken = ", ".join(
         f"drone {k + 1} takes animal {take}" if take >= 0 else f"drone {k + 1} stands by"
         for k, take in enumerate(agreement.takes)
     )
-    return f"{n_views} views {agreed} on {n_animals} animals (confidence {agreement.confidence:.2f}); {taken}"
+    return f"{n_views} views {agreed} on {count} (confidence {agreement.confidence:.2f}); {taken}"

@@ -28,6 +28,7 @@ __all__ = ["RelayShell", "key_path", "setup"]
 
 FLEET_STATE_PERIOD_S = 0.25
 LINK_STATE_PERIOD_S = 1.0
+HANDSHAKE_DATAGRAMS = 4  # a second, unproven: more than that, or for longer, is no meeting of two
 PUMP_PERIOD_S = 0.1  # how soon a message that waited for room under the cap is tried again
 
 
@@ -46,6 +47,7 @@ class RelayShell:
         self._mission: mission_state_t | None = None
         self._vehicle: vehicle_state_t | None = None
         self._refused: dict[Refusal, int] = {}
+        self._was_unproven = False  # in the second before
 
     def mission_said(self, message: mission_state_t) -> None:
         """Keep the navigator's last word for this drone's row."""
@@ -95,8 +97,12 @@ class RelayShell:
         now_us = self._runtime.utime
         self._runtime.publish(channels.LINK_STATE, self._core.link_state(now_us))
         refused = dict(self._core.refused)
+        n_unproven = self._refused.get(Refusal.UNPROVEN, 0)
         news = {reason: n - self._refused.get(reason, 0) for reason, n in refused.items()}
         self._refused = refused
+        if news.get(Refusal.UNPROVEN, 0) <= HANDSHAKE_DATAGRAMS and not self._was_unproven:
+            news.pop(Refusal.UNPROVEN, None)  # two that meet need a second to prove themselves
+        self._was_unproven = refused.get(Refusal.UNPROVEN, 0) > n_unproven
         self._tell(
             "refused",
             ", ".join(f"{n} {reason.value}" for reason, n in news.items() if n),

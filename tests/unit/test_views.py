@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from drivers.cameras.pinhole import Pinhole, Pose
 from drivers.sim.render.renderer import SeaRenderer
 from drivers.sim.render.scene import AnimalView
-from tools.views import Agreement, ViewsError, agree, command, common_frame, draw, read_pictures
+from tools.views import Agreement, ViewsError, _told, agree, command, common_frame, draw, read_pictures
 
 DATA = Path(os.environ.get("PODWATCH_REAL_DATA", Path(__file__).parents[3] / "shared" / "data"))
 CAMERA = Pinhole((640, 480), float(np.radians(60)))
@@ -230,3 +230,10 @@ def test_the_figure_has_four_rows_with_own_numbers_and_agreed_names() -> None:
     red = [patch.get_edgecolor()[:3] for axes in figure.axes[6:] for patch in axes.patches]
     assert [colour[0] > 0.9 and colour[1] < 0.2 for colour in red] == [True, False, False, False]
     assert figure.axes[7].get_xlabel() == "stands by"
+
+
+def test_one_box_a_view_is_said_to_prove_nothing() -> None:
+    one = np.array([[10.0, 10.0, 60.0, 40.0]])
+    told = _told(agree([one] * 3, [(640, 480)] * 3))
+    assert "1 animal," in told
+    assert "one box in each view fits whatever animal it is" in told
