@@ -1,8 +1,12 @@
 """`podwatch boat` in a process of its own, beside drones' relays on real sockets."""
 
+import contextlib
+import os
+import pty
 import select
 import subprocess
 import sys
+import termios
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -27,7 +31,7 @@ from tools.fleet.machine import boat_radio, drone_settings, read_fleet
 from tools.fleet.text import mission_text
 
 ROOT = Path(__file__).parents[2]
-DEADLINE_S = 40.0
+DEADLINE_S = 25.0
 OBEYS = {
     operator_t.NONE: State.MONITOR,
     operator_t.HOLD: State.HOLD,
@@ -141,6 +145,40 @@ def test_an_order_that_is_not_obeyed_is_exit_1_and_names_who_does_not(bench, mon
     done = bench.boat("--say", "hold 2")
     assert done.returncode == FAILED
     assert "hold 2: not obeyed by drone 2 within 8 s" in done.stderr
+
+
+def test_at_a_terminal_orders_are_typed_below_the_view(bench):
+    ours, theirs = pty.openpty()
+    termios.tcsetwinsize(theirs, (40, 100))
+    code = "from tools.cli import main; main()"
+    seen = bytearray()
+    with subprocess.Popen(
+        [sys.executable, "-c", code, "boat", str(bench.path)],
+        cwd=ROOT,
+        stdin=theirs,
+        stdout=theirs,
+        stderr=theirs,
+    ) as process:
+        os.close(theirs)
+
+        def read() -> None:
+            if select.select([ours], [], [], 0)[0]:
+                with contextlib.suppress(OSError):  # the other end was closed: it has ended
+                    seen.extend(os.read(ours, 65536))
+
+        try:
+            bench.fly_while(lambda: (read(), b"% lost" not in seen)[1])
+            os.write(ours, b"holx\x7fd 2\r")
+            order = bench.drones[1].relay
+            bench.fly_while(lambda: (read(), order.fleet_state(now_us()).order.command != operator_t.HOLD)[1])
+            assert bench.drones[0].relay.fleet_state(now_us()).order.command == operator_t.NONE
+            os.write(ours, b"quit\r")
+            bench.fly_while(lambda: (read(), process.poll() is None)[1])
+        finally:
+            process.kill()
+    os.close(ours)
+    assert process.returncode == 0
+    assert b"said: hold 2" in seen
 
 
 def test_what_is_no_order_is_told_before_anything_is_sent(bench):

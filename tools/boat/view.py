@@ -23,6 +23,8 @@ def link_line(boat: Boat, now_us: int) -> str:
     up = [link for link in boat.links(now_us) if link.up]
     if not up:
         return "no drone hears the boat"
+    if not boat.is_linked(now_us):
+        return f"drone {up[0].peer_id} hears the boat; it does not know the fleet's time yet"
     return "; ".join(
         f"drone {link.peer_id}, {link.age_ms / 1000:.1f} s ago, {link.loss:.0%} lost" for link in up
     )
