@@ -97,7 +97,7 @@ class Observer:
 
     def remembered(self, header: MapHeader, to_chart: Array, now_s: float) -> list[MapAnimal]:
         """The remembered animals in this episode's map frame, no view counted yet."""
-        known = list(self.memory.known_at(now_s).forgotten_counts())[:MAX_ANIMALS]
+        known = list(self.memory.known_at(now_s).newest_first().forgotten_counts())[:MAX_ANIMALS]
         if known and self.view is None and len(self.marks):
             # Pictures without geometry have no common ground: the remembered frame is found by the boxes
             # alone.

@@ -207,6 +207,23 @@ class Memory:
         kept = Memory(tuple(one for one, _ in rows.values()), tuple(seen for _, seen in rows.values()))
         return kept.known_at(now_s)
 
+    def refreshed(self, sights: Iterable[tuple[MapAnimal, float]]) -> "Memory":
+        """The memory with newer sights of its animals, each with the second it was seen; a pod that was
+        watched for minutes is not where the last episode left it.
+        """
+        rows = {one.id: (one, seen) for one, seen in zip(self.animals, self.last_seen_s, strict=True)}
+        for one, seen_s in sights:
+            if one.id in rows and seen_s > rows[one.id][1]:
+                rows[one.id] = (one, seen_s)
+        return Memory(tuple(one for one, _ in rows.values()), tuple(seen for _, seen in rows.values()))
+
+    def newest_first(self) -> "Memory":
+        """The same animals, the latest seen at the head: what a map has no room for is the longest unseen."""
+        order = sorted(range(len(self.animals)), key=lambda row: -self.last_seen_s[row])
+        return Memory(
+            tuple(self.animals[row] for row in order), tuple(self.last_seen_s[row] for row in order)
+        )
+
     def forgotten_counts(self) -> tuple[MapAnimal, ...]:
         """The animals with no view counted yet, as a new episode starts from them; a mirrored axis is
         lost."""

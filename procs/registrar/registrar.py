@@ -215,7 +215,7 @@ class Registrar:
         ):  # on the ground a barometer says less than nothing at times
             view = self._view(pose)
         options = {} if self._register is None else {"register": self._register}
-        memory = None if running.proposal.fresh else self.memory
+        memory = None if running.proposal.fresh else self._remembered()
         first = running.looks[0].node
         if instant > 0 and first is not None and first.finished:
             memory = first.result.memory  # the second look confirms the ids of the first
@@ -233,6 +233,14 @@ class Registrar:
         )
         for lost in running.lost:
             look.node.drop_member(lost)
+
+    def _remembered(self) -> Memory | None:
+        """The animals of earlier episodes where somebody last saw them, by the map's upkeep."""
+        if self.memory is None:
+            return None
+        return self.memory.refreshed(
+            (entry.unturned(), entry.seen_fleet_utime / 1e6) for entry in self.map.entries.values()
+        )
 
     def _end(
         self, running: Running, fleet_utime: int, pose_at: Callable[[int], Pose | None], utime: int

@@ -1,6 +1,7 @@
 """Registrars of a whole ring, in memory: from a wish for an episode to the names of the newest boxes."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -216,6 +217,25 @@ def test_the_next_episode_keeps_the_ids_and_begins_only_when_the_last_is_over():
     fleet.propose(2)  # under way: no other one
     fleet.run(7.0)
     assert {fleet.finished(k).number for k in fleet.ids} == {2}
+    assert fleet.names(1) == fleet.names(2) == before
+
+
+def test_a_pod_watched_while_its_animals_changed_places_keeps_their_ids():
+    """The last episode remembers another constellation, 60 m away."""
+    fleet = flown(3)
+    before = fleet.names(2)
+    goals = np.roll(POD, 1, axis=0) * (1.0, 1.3) + (60.0, 20.0)
+    starts, poses = fleet.animals, fleet.poses
+    for share in np.linspace(0.0, 1.0, 300):
+        fleet.animals = starts + share * (goals - starts)
+        fleet.poses = {
+            k: replace(one, n_m=one.n_m + share * 60.0, e_m=one.e_m + share * 20.0)
+            for k, one in poses.items()
+        }
+        fleet.step()
+    fleet.propose(3)
+    fleet.run(7.0)
+    assert all(fleet.finished(k).number == 2 and fleet.finished(k).consensus for k in fleet.ids)
     assert fleet.names(1) == fleet.names(2) == before
 
 

@@ -1,5 +1,7 @@
 """The map on the wire, 9 bytes an animal, and the memory between episodes."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -141,6 +143,22 @@ def test_memory_keeps_unseen_animals_ten_minutes_and_no_longer():
 
 def test_an_animal_that_only_a_map_carries_is_not_remembered_as_seen():
     assert Memory().after([whale(3, hits=0)], now_s=0.0).animals == ()
+
+
+def test_a_newer_sight_moves_a_remembered_animal_and_an_older_or_unknown_one_does_nothing():
+    memory = Memory().after([whale(1), whale(2)], now_s=100.0)
+    moved = replace(whale(1), n_m=50.0)
+    seen = memory.refreshed([(moved, 700.0), (replace(whale(2), n_m=9.0), 99.0), (whale(3), 700.0)])
+    assert seen.animals == (moved, whale(2))
+    assert seen.last_seen_s == (700.0, 100.0)
+    assert [one.id for one in seen.known_at(100.0 + REUSE_AFTER_S + 1).animals] == [1]
+
+
+def test_the_latest_seen_stand_first_where_a_map_has_not_room_for_all():
+    memory = (
+        Memory().after([whale(1)], now_s=100.0).after([whale(2)], now_s=200.0).after([whale(3)], now_s=150.0)
+    )
+    assert [one.id for one in memory.newest_first().animals] == [2, 3, 1]
 
 
 def test_a_new_episode_counts_anew():
