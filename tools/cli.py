@@ -94,7 +94,7 @@ def train_detector(
 ) -> None:
     """Train the detector and export it to ONNX."""
     with wanted_extra("train"):
-        from tools.train_detector import Settings, command
+        from tools.train.detector.training import Settings, command
     with plain_errors():
         command(out, data, Settings.steps if steps is None else steps, seed, smoke)
 
@@ -109,11 +109,11 @@ def train_assigner(
 ) -> None:
     """Train the assigner's network, export it for numpy and measure it."""
     with wanted_extra("train"):
-        from tools import train_assigner, train_assigner_paper
+        from tools.train.assigner import paper, training
     with plain_errors():
         if loss not in ("ours", "paper"):
             raise ValueError(f"loss {loss!r} is not known; there are: ours, paper")
-        trainer = train_assigner if loss == "ours" else train_assigner_paper
+        trainer = training if loss == "ours" else paper
         trainer.command(out, seed, steps, smoke)
 
 

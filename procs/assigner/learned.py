@@ -27,7 +27,7 @@ LARGEST = 60_000.0  # of a float16
 
 @dataclass(frozen=True)
 class Network:
-    """Weights by name, as tools/train_assigner.py writes them; every matrix is (in, out)."""
+    """Weights by name, as tools/train/assigner/training.py writes them; every matrix is (in, out)."""
 
     weights: dict[str, Floats]
 
@@ -73,7 +73,7 @@ def block_of(number: int, n_rounds: int) -> int:
 
 
 def load(path: Path) -> Network:
-    """The network that tools/train_assigner.py wrote to this file.
+    """The network that tools/train/assigner/training.py wrote to this file.
 
     Raises ValueError for a file that holds anything else.
     """

@@ -39,8 +39,8 @@ from tools.bench.registration_scenes import (
 )
 from tools.bench.registration_speed import printed_costs
 from tools.cli import app
-from tools.detector_data import Sample
-from tools.detector_eval import box_iou
+from tools.train.detector.samples import Sample
+from tools.train.detector.scores import box_iou
 
 DEG = np.pi / 180
 CLEAN = Cell("clean", 9, jitter=0.0, full_view=True)

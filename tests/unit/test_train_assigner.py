@@ -13,11 +13,11 @@ from typer.testing import CliRunner
 from procs.assigner.learned import Network, load
 from procs.assigner.many import gnn_rings
 from tools.cli import app
-from tools.train_assigner import Settings, assignment_loss, batch_tensors, train
-from tools.train_assigner_data import Batch, instances, mixed_batch, solved
-from tools.train_assigner_export import check_export
-from tools.train_assigner_model import RingNetwork
-from tools.train_assigner_paper import paper_loss
+from tools.train.assigner.data import Batch, instances, mixed_batch, solved
+from tools.train.assigner.export import check_export
+from tools.train.assigner.model import RingNetwork
+from tools.train.assigner.paper import paper_loss
+from tools.train.assigner.training import Settings, assignment_loss, batch_tensors, train
 
 TINY = Settings(steps=6, warmup_steps=2, cooldown_steps=2, polish_steps=2, save_every_steps=3)
 
@@ -104,7 +104,7 @@ def test_an_export_that_numpy_reads_otherwise_is_refused(
     found = load(weights)
     other = Network(found.weights | {"goal.weight": -found.weights["goal.weight"]})
     monkeypatch.setattr(
-        "tools.train_assigner_export.gnn_rings",
+        "tools.train.assigner.export.gnn_rings",
         lambda costs, rounds, loss, random, _: gnn_rings(costs, rounds, loss, random, other),
     )
     with pytest.raises(ValueError, match="export anew"):

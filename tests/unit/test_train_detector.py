@@ -16,7 +16,10 @@ from typer.testing import CliRunner
 from drivers.cameras.pinhole import apply_homography
 from procs.detector.yolo import Detections, Detector
 from tools.cli import app
-from tools.detector_data import (
+from tools.render import measured_right_whales, render_dataset, scenes
+from tools.train.detector.loss import assign, detection_loss, pair_iou
+from tools.train.detector.model import WhaleDetector, cell_centres, decode
+from tools.train.detector.samples import (
     Sample,
     augment,
     letterboxed,
@@ -25,11 +28,8 @@ from tools.detector_data import (
     read_yolo,
     scene_sample,
 )
-from tools.detector_eval import average_precision, match, recall_by_length, score
-from tools.detector_loss import assign, detection_loss, pair_iou
-from tools.detector_model import WhaleDetector, cell_centres, decode
-from tools.render import measured_right_whales, render_dataset, scenes
-from tools.train_detector import Settings, averaged, check_export, held_out, real_data, train
+from tools.train.detector.scores import average_precision, match, recall_by_length, score
+from tools.train.detector.training import Settings, averaged, check_export, held_out, real_data, train
 
 TINY = Settings(steps=4, batch=2, scenes=2, early_side=64, side=64, warmup_steps=1, save_every_steps=2)
 

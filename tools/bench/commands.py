@@ -34,7 +34,7 @@ def bench_detection(
 ) -> None:
     """Recall, precision and AP50 on held-out photographs and rendered scenes."""
     with wanted_extra("train"):
-        from tools.train_detector import evaluate
+        from tools.train.detector.training import evaluate
     with plain_errors():
         evaluate(scenes=scenes, seed=seed)
 

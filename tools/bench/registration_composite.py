@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tools.detector_data import Sample
+from tools.train.detector.samples import Sample
 
 __all__ = ["VIEW_SIZE", "CompositeView", "composite_views"]
 

@@ -19,7 +19,7 @@ from procs.detector.yolo import Detector
 from procs.registrar.box_icp import box_icp
 from tools.bench.registration_composite import VIEW_SIZE, CompositeView, composite_views
 from tools.bench.table import Row
-from tools.detector_data import held_out, read_yolo, real_data
+from tools.train.detector.samples import held_out, read_yolo, real_data
 
 __all__ = ["draw", "pixel_rows"]
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from procs.detector.yolo import Detections, Detector
-from tools.detector_data import Sample
+from tools.train.detector.samples import Sample
 
 __all__ = ["Score", "average_precision", "box_iou", "match", "recall_by_length", "score"]
 

@@ -55,7 +55,7 @@ def real_data() -> Path:
     """The folder of real pictures: PODWATCH_REAL_DATA, or ../shared/data beside the project; it may be
     missing.
     """
-    beside = Path(__file__).resolve().parents[2] / "shared" / "data"
+    beside = Path(__file__).resolve().parents[4] / "shared" / "data"
     return Path(os.environ.get("PODWATCH_REAL_DATA", str(beside)))
 
 

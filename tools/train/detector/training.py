@@ -20,7 +20,10 @@ import torch
 from numpy.typing import NDArray
 
 from procs.detector.yolo import Detector
-from tools.detector_data import (
+from tools.train.detector.export import check_export, export
+from tools.train.detector.loss import detection_loss
+from tools.train.detector.model import WhaleDetector, cell_centres, decode
+from tools.train.detector.samples import (
     Sample,
     augment,
     cached_scenes,
@@ -31,10 +34,7 @@ from tools.detector_data import (
     real_data,
     scene_sample,
 )
-from tools.detector_eval import Score, recall_by_length, score
-from tools.detector_export import check_export, export
-from tools.detector_loss import detection_loss
-from tools.detector_model import WhaleDetector, cell_centres, decode
+from tools.train.detector.scores import Score, recall_by_length, score
 
 __all__ = ["Settings", "command", "evaluate", "held_out", "real_data", "train"]
 

@@ -11,8 +11,8 @@ from torch import Tensor
 from procs.assigner.learned import Network, load
 from procs.assigner.many import gnn_rings, resolve_rings
 from procs.assigner.ring_rows import seen_by_round
-from tools.train_assigner_data import instances, solved
-from tools.train_assigner_model import RingNetwork
+from tools.train.assigner.data import instances, solved
+from tools.train.assigner.model import RingNetwork
 
 __all__ = ["check_export", "export", "measure"]
 

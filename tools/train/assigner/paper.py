@@ -14,8 +14,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from tools.train_assigner_data import instances, solved
-from tools.train_assigner_export import LOOK_SEED
+from tools.train.assigner.data import instances, solved
+from tools.train.assigner.export import LOOK_SEED
 
 __all__ = ["PaperNetwork", "PaperSettings", "command", "paper_loss"]
 

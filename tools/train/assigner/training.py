@@ -19,9 +19,9 @@ from torch.nn import functional
 
 from procs.assigner.learned import load
 from procs.assigner.ring_rows import seen_by_round
-from tools.train_assigner_data import Batch, mixed_batch
-from tools.train_assigner_export import check_export, export, measure
-from tools.train_assigner_model import RingNetwork
+from tools.train.assigner.data import Batch, mixed_batch
+from tools.train.assigner.export import check_export, export, measure
+from tools.train.assigner.model import RingNetwork
 
 __all__ = ["Settings", "command", "train"]
 

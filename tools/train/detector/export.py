@@ -10,7 +10,7 @@ import onnx
 import torch
 
 from procs.detector.yolo import open_session
-from tools.detector_model import STRIDES, Exported, WhaleDetector
+from tools.train.detector.model import STRIDES, Exported, WhaleDetector
 
 __all__ = ["check_export", "export"]
 
