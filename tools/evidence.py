@@ -32,6 +32,7 @@ __all__ = [
     "Truth",
     "drone_log",
     "load_run",
+    "read_samples",
     "state_name",
 ]
 
@@ -177,7 +178,8 @@ def load_run(folder: Path) -> Run:
     truth, problems = _read_truth(folder / "truth.mcap", about, camera)
     logs, messages = [], {}
     for drone_id in sorted(clocks):
-        samples, complaints = _read_log(folder, drone_id, clocks[drone_id])
+        log = folder / f"drone_{drone_id}.mcap"
+        samples, complaints = read_samples([*segments(log), *pictures(log)], drone_id, clocks[drone_id])
         messages[drone_id] = samples
         problems += complaints
         logs.append(drone_log(drone_id, samples, camera))
@@ -251,12 +253,11 @@ def _tracks(rows: Iterable[tuple[int, int, tuple[float, ...]]], shape: tuple[int
     return dict(sorted(tracks.items()))
 
 
-def _read_log(folder: Path, drone_id: int, clock: Clock) -> tuple[Samples, list[str]]:
+def read_samples(paths: Iterable[Path], drone_id: int, clock: Clock) -> tuple[Samples, list[str]]:
     """A drone's messages by channel, and what could not be read: a damaged log costs that drone the rest."""
     samples: Samples = {name: [] for name in READ_CHANNELS}
     problems: list[str] = []
-    log = folder / f"drone_{drone_id}.mcap"
-    for path in [*segments(log), *pictures(log)]:
+    for path in paths:
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             try:

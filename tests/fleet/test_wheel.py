@@ -66,7 +66,7 @@ def test_the_wheel_holds_all_that_runs_and_no_tests(wheel):
     kinds = {Path(name).suffix for name in wanted}
     assert {".py", ".lcm", ".toml", ".onnx", ".j2"} <= kinds
     assert {"lcmtypes/podwatch/__init__.py", "lcmtypes/podwatch/frame_t.py"} <= held
-    assert "tools/report.html.j2" in held
+    assert "tools/report/page.html.j2" in held
     tops = {name.split("/")[0] for name in held}
     assert {top for top in tops if not top.endswith(".dist-info")} == set(PACKAGES)
 

@@ -13,8 +13,8 @@ from procs.navigator.states import State
 from tests.unit.fake_run import FakeRun
 from tools.evidence import EvidenceError, load_run
 from tools.judge import judge
-from tools.report import STATE_WORDS, make_report
-from tools.report_figures import draw_map, draw_timeline, pick_shots
+from tools.report.figures import draw_map, draw_timeline, pick_shots
+from tools.report.page import STATE_WORDS, make_report
 
 VOID = {"meta", "image", "path", "br", "link", "rect", "circle", "polyline"}
 

@@ -14,7 +14,7 @@ from jinja2 import Environment, StrictUndefined
 
 from tools.evidence import Run, load_run
 from tools.judge import drone_list, judge
-from tools.report_figures import animal_colour, draw_map, draw_timeline, drone_colour, pick_shots
+from tools.report.figures import animal_colour, draw_map, draw_timeline, drone_colour, pick_shots
 from tools.summary import headline, summary_of
 
 __all__ = ["STATE_WORDS", "make_report"]
@@ -62,7 +62,9 @@ def _render(run: Run) -> str:
         state_words=_state_words,
         state_colour=_state_colour,
     )
-    template = environment.from_string(files("tools").joinpath("report.html.j2").read_text(encoding="utf-8"))
+    template = environment.from_string(
+        files("tools.report").joinpath("page.html.j2").read_text(encoding="utf-8")
+    )
     return template.render(
         name=run.folder.name,
         summary=summary,
