@@ -23,6 +23,7 @@ EXIT_CODES = {
     ("drivers.sim.render.scene", "SurfaceError"): UNUSABLE,
     ("tools.boat.orders", "OrderError"): UNUSABLE,
     ("tools.boat.orders", "BoatError"): FAILED,
+    ("tools.bench.faults", "FaultsError"): FAILED,
     ("tools.evidence", "EvidenceError"): UNUSABLE,
     ("tools.views", "ViewsError"): UNUSABLE,
     ("procs.detector.decode", "ModelError"): MISSING,

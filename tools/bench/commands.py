@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from tools.errors import plain_errors, wanted_extra
+from tools.errors import FAILED, plain_errors, wanted_extra
 
 __all__ = ["bench"]
 
@@ -95,3 +95,17 @@ def bench_logs(
 
     with plain_errors():
         command(out, seconds, real_time=real_time)
+
+
+@bench.command("faults")
+def bench_faults(
+    only: Annotated[str, typer.Option(help="Only faults with this in their name.")] = "",
+    workers: Annotated[int, typer.Option(min=1, help="Copies of the checkout, side by side.")] = 2,
+    out: Annotated[Path, typer.Option(help="Folder for the table.")] = Path("runs/bench"),
+) -> None:
+    """Put faults of one line into a copy of the checkout; exit 1 if one does not turn its test red."""
+    with wanted_extra("dev"):
+        from tools.bench.faults import command
+    with plain_errors():
+        if not command(only, workers, out):
+            raise typer.Exit(FAILED)
