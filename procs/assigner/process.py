@@ -17,7 +17,6 @@ from lcmtypes.podwatch import (
     identities_t,
     link_state_t,
     map_animal_t,
-    operator_t,
     ring_assign_t,
     vehicle_state_t,
 )
@@ -70,8 +69,6 @@ class AssignerShell:
         self._living = tuple(member for member in living if member not in going)
         self._watched = {row.id: row.animal for row in state.rows if row.alive and row.animal >= 0}
         self._book.hear(state)
-        if state.order.command == operator_t.LEAVE:
-            self._book.leave(state.order.animal)
         self._goes_home = own_id in going
         if self._goes_home:
             self._give_up()

@@ -1,4 +1,4 @@
-"""How long the fleet has watched each animal, and which of them this drone was told to leave.
+"""How long the fleet has watched each animal, and which of them it was told to leave.
 
 An animal grows dearer with every minute that any drone has watched it. A survey wants effort spread over
 the individuals of a pod, and a drone overhead is a disturbance whose length permits limit: of two animals
@@ -23,13 +23,14 @@ class WatchBook:
 
     def __init__(self) -> None:
         self._watched_s: dict[int, float] = {}
-        self._left: list[int] = []
+        self._left: tuple[int, ...] = ()
         self._heard_us = 0
 
     def hear(self, state: fleet_state_t) -> None:
         """Count the time since the last fleet table for every animal over which a living drone says it
-        stands.
+        stands; take over which are to be left.
         """
+        self._left = tuple(state.left)
         gap_us = state.utime - self._heard_us
         self._heard_us = state.utime
         if not 0 < gap_us <= LONGEST_GAP_US:
@@ -38,12 +39,8 @@ class WatchBook:
         for animal in sorted({animal for animal in over if animal >= 0}):
             self._watched_s[animal] = self._watched_s.get(animal, 0.0) + gap_us * 1e-6
 
-    def leave(self, animal: int) -> None:
-        """This drone was told to leave the animal: it takes it no more."""
-        if animal not in self._left:
-            self._left.append(animal)
-
     def may_take(self, animal: int) -> bool:
+        """Whether nobody was told to leave the animal."""
         return animal not in self._left
 
     def minutes(self, animal: int) -> float:
@@ -54,4 +51,3 @@ class WatchBook:
         """An id that the fleet's map has dropped may mean another animal when it comes back."""
         ids = [one.id for one in known]
         self._watched_s = {animal: time_s for animal, time_s in self._watched_s.items() if animal in ids}
-        self._left = [animal for animal in self._left if animal in ids]

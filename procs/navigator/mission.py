@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from drivers.cameras.pinhole import Pinhole
 from lcmtypes import make, podwatch
 from procs.history import camera_of
-from procs.navigator import behaviours, finds, resume, surplus
+from procs.navigator import behaviours, finds, resume
 from procs.navigator.decisions import overriding_events
 from procs.navigator.flight import limited
 from procs.navigator.formation import separate
@@ -99,7 +99,6 @@ class Navigator:
         finds.sense(now, self.memory, self.camera)
         finds.share(now, self.memory, self.camera)
         finds.keep_clock(now, self.memory)
-        surplus.note_left(now, self.memory)
         self._decide(now)
         step = BEHAVIOURS[self.memory.state](now, self.memory, self.camera)
         setpoint = self._setpoint(now, step)

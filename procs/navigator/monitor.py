@@ -103,7 +103,7 @@ def monitor(now: Situation, memory: Memory, camera: Pinhole) -> Step:
         memory.seen_us = now.utime
     unseen_s = now.seconds_since(memory.seen_us)
     step = _over_animal(now, memory, unseen_s)
-    if now.command == podwatch.operator_t.LEAVE and _told_to_leave(now, memory):
+    if memory.animal in now.left:
         event = Event.LEAVE
     elif unseen_s > GIVE_UP_S or (unseen_s > UNSURE_S and _only_strangers(now, memory)):
         memory.lost_animal = memory.animal
@@ -125,10 +125,6 @@ def _only_strangers(now: Situation, memory: Memory) -> bool:
     elif memory.strangers_since_us == 0:
         memory.strangers_since_us = now.utime
     return memory.strangers_since_us > 0 and now.seconds_since(memory.strangers_since_us) > STRANGERS_S
-
-
-def _told_to_leave(now: Situation, memory: Memory) -> bool:
-    return now.inputs.fleet is not None and now.inputs.fleet.order.animal == memory.animal
 
 
 def _over_animal(now: Situation, memory: Memory, unseen_s: float) -> Step:

@@ -119,7 +119,6 @@ class Memory:
     free_animals: tuple[int, ...] = ()  # those
     free_key: EpisodeKey = (0, 0)  # newest episode that had ended when they were looked at last
     n_asked: int = 0  # episodes that have ended and left them to nobody
-    left: tuple[int, ...] = ()  # animals that any drone was ordered to leave
     held_us: int = 0  # last instant of doubt
     pilot_us: int = 0  # last instant at which the pilot had it
     watch_seen: bool = False  # it has seen the fleet watch, at any time
@@ -298,6 +297,11 @@ class Situation:
         if order is None or order.utime == 0 or order.target not in (0, self.drone_id):
             return int(podwatch.operator_t.NONE)
         return int(order.command)
+
+    @property
+    def left(self) -> tuple[int, ...]:
+        """Animals that the boat ordered to leave."""
+        return tuple(self.inputs.fleet.left) if self.inputs.fleet is not None else ()
 
     def map_position(self, animal: int, max_age_s: float = 60.0) -> Array | None:
         """(2,) of an animal in the fleet's map, None where the map does not hold it or held it too long

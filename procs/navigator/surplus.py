@@ -4,25 +4,14 @@ It takes an animal by the certificate of an episode and in no other way, so that
 same, and nobody takes one that another still watches. Those that watch go on; the episode runs beside that.
 """
 
-from lcmtypes.podwatch import operator_t
 from procs.navigator.situation import Memory, Situation, episode_key
 from procs.navigator.states import GATHERED
 
-__all__ = ["FREE_FOR_S", "MOST_ASKED", "asks", "note_left"]
+__all__ = ["FREE_FOR_S", "MOST_ASKED", "asks"]
 
 FREE_FOR_S = 5.0  # beside the 3 s after which a drone counts as lost: it may only have been silent
 SEEN_WITHIN_S = 10.0  # an animal that nobody saw for longer may have dived
 MOST_ASKED = 3  # episodes over the same animals: views that do not agree cost the ring its bytes
-
-
-def note_left(now: Situation, memory: Memory) -> None:
-    """Keep in mind which animals the boat wants left, for as long as the fleet's map knows them."""
-    fleet, identities = now.inputs.fleet, now.inputs.identities
-    if now.command == operator_t.LEAVE and fleet is not None and fleet.order.animal not in memory.left:
-        memory.left = (*memory.left, int(fleet.order.animal))
-    if memory.left and identities is not None and identities.n_map:
-        known = [entry.id for entry in identities.map]
-        memory.left = tuple(animal for animal in memory.left if animal in known)
 
 
 def asks(now: Situation, memory: Memory) -> bool:
@@ -37,7 +26,7 @@ def asks(now: Situation, memory: Memory) -> bool:
     free = [
         entry.id
         for entry in identities.map
-        if entry.id not in (*watched, *memory.left) and now.map_position(entry.id, SEEN_WITHIN_S) is not None
+        if entry.id not in (*watched, *now.left) and now.map_position(entry.id, SEEN_WITHIN_S) is not None
     ]
     known = [animal for animal in memory.free_animals if animal not in watched]
     key = episode_key(identities)

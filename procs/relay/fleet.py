@@ -25,7 +25,7 @@ from procs.relay.rows import COUNTER_RANGE, NO_MARKER, Marker, Row, pack_row, un
 __all__ = ["TABLE_LIMIT_BYTES", "FleetTable", "Order"]
 
 TABLE_LIMIT_BYTES = 300
-MAX_ORDERS = 6  # newest first; 13 bytes each
+MAX_ORDERS = 6  # the newest, and one of the rest in turn; 13 bytes each
 ORDER = struct.Struct(">qBBBH")
 NO_ANIMAL = 255
 COUNTER_STEP_US = 100_000
@@ -60,6 +60,7 @@ class Order:
 
 
 NO_ORDER = Order(0, operator_t.NONE, 0, -1, 0)
+ABOUT_ANIMALS = (operator_t.LEAVE, operator_t.WATCH)
 
 
 @dataclass(frozen=True)
@@ -78,12 +79,14 @@ class FleetTable:
         self.own_id = own_id
         self.ids = ids
         self._entries: dict[int, _Entry] = {}
-        self._orders: dict[int, Order] = {}  # newest by target
+        self._orders: dict[int, Order] = {}  # to fly, the newest by target
+        self._animal_orders: dict[int, Order] = {}  # to leave it or to watch it again, the newest by animal
         self._is_own_said = False
         self._sent: dict[
             int, dict[int, tuple[int, int]]
         ] = {}  # to each peer, of each row: counter, how recently
         self._n_sent = 0
+        self._n_packed = 0
 
     def say(self, row: Row, born_us: int, now_us: int) -> None:
         """Set this drone's own row. `row.marker` says its find and waypoint in full. Raises RowError."""
@@ -93,7 +96,15 @@ class FleetTable:
 
     def order(self, order: Order) -> bool:
         """Take in an order -> whether it is news: the newest for its target wins, and a newer one for
-        everybody ends those for one."""
+        everybody ends those for one. What is said of an animal stands beside them: a drone on hold hears
+        that its animal is to be left.
+        """
+        if order.command in ABOUT_ANIMALS:
+            known = self._animal_orders.get(order.animal)
+            if known is not None and known.utime_us >= order.utime_us:
+                return False
+            self._animal_orders[order.animal] = order
+            return True
         for target in (order.target, BOAT_ID):
             if target in self._orders and self._orders[target].utime_us >= order.utime_us:
                 return False
@@ -113,6 +124,17 @@ class FleetTable:
         mine = [order for target, order in self._orders.items() if target in (BOAT_ID, drone_id)]
         return max(mine, key=lambda order: order.utime_us, default=NO_ORDER)
 
+    def left(self, fleet_us: int | None) -> list[int]:
+        """Ids of the animals that are to be left. Where fleet time is not known, orders outlive their expiry:
+        rather an animal too few is watched.
+        """
+        if fleet_us is not None:
+            self._animal_orders = {
+                animal: order for animal, order in self._animal_orders.items() if order.is_valid(fleet_us)
+            }
+        orders = self._animal_orders.items()
+        return sorted(animal for animal, order in orders if order.command == operator_t.LEAVE)
+
     @property
     def is_windowed(self) -> bool:
         """Whether the table is too large for one datagram."""
@@ -125,7 +147,7 @@ class FleetTable:
         A larger table goes as a window that moves on at each call: this drone's own row, then rows that are
         news to the peer, then the rest, each by how long ago it was sent to that peer.
         """
-        orders = sorted(self._orders.values(), key=lambda order: -order.utime_us)[:MAX_ORDERS]
+        orders = self._orders_to_send()
         tail = bytes([len(orders)]) + b"".join(_pack_order(order) for order in orders)
         room = TABLE_LIMIT_BYTES - self._bitmap_bytes - len(tail)
         sent = self._sent.setdefault(peer_id, {})
@@ -180,6 +202,15 @@ class FleetTable:
         """All known rows as messages: this drone first, the rest by id."""
         members = sorted(self._entries, key=lambda member: (member != self.own_id, member))
         return [self._message(member, member in living, now_us) for member in members]
+
+    def _orders_to_send(self) -> list[Order]:
+        """The newest first; where there are too many, the last place goes to each of the rest in turn."""
+        orders = sorted(
+            [*self._orders.values(), *self._animal_orders.values()], key=lambda order: -order.utime_us
+        )
+        newest, rest = orders[: MAX_ORDERS - 1], orders[MAX_ORDERS - 1 :]
+        self._n_packed += 1
+        return newest + ([rest[self._n_packed % len(rest)]] if rest else [])
 
     @property
     def _bitmap_bytes(self) -> int:

@@ -111,6 +111,7 @@ class Link:
             round_trip_us=min(self.clock.round_trip_us(now_us), NEVER_MS),
             n_rejected=self.n_rejected,
             n_dropped=self.queue.n_dropped + self.n_unsent,
+            cap_bytes_s=self.window.bytes_per_s,
             n_kinds=len(kinds),
             kinds=kinds,
             bytes_out=[account.bytes_out for account in accounts],

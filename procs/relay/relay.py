@@ -209,8 +209,10 @@ class Relay:
         neighbours: Neighbours = self.members.neighbours(now_us)
         is_ok = self.fleet_clock.is_ok(now_us)
         offset_us = round(self.fleet_clock.offset_us)
+        fleet_us = now_us + offset_us if is_ok else None
         heard = [*living, *(member for member in (BOAT_ID,) if self.members.lives(member, now_us))]
         rows = self.fleet.rows(heard, now_us)
+        left = self.fleet.left(fleet_us)
         return make(
             fleet_state_t,
             fleet_offset_us=offset_us,
@@ -221,7 +223,9 @@ class Relay:
             members=self.members.bitmap(now_us),
             n_rows=len(rows),
             rows=rows,
-            order=self.fleet.order_for(self.own_id, now_us + offset_us if is_ok else None).message(),
+            order=self.fleet.order_for(self.own_id, fleet_us).message(),
+            n_left=len(left),
+            left=left,
         )
 
     def link_state(self, now_us: int) -> link_state_t:

@@ -36,7 +36,6 @@ OBEYS = {
     operator_t.NONE: State.MONITOR,
     operator_t.HOLD: State.HOLD,
     operator_t.RETURN: State.RETURN,
-    operator_t.LEAVE: State.RENDEZVOUS,
 }
 
 
@@ -71,8 +70,9 @@ class Drone:
         if now_us() < self.due_us:
             return
         self.due_us += round(TICK_S * 1e6)
-        order = self.relay.fleet_state(now_us()).order
-        if order.command == operator_t.LEAVE and order.animal == self.animal:
+        fleet = self.relay.fleet_state(now_us())
+        order = fleet.order
+        if self.animal in fleet.left:
             self.animal = -1
         mission = make(
             mission_state_t, state=OBEYS[order.command], animal=self.animal, found=True, found_n_m=40.0
@@ -136,7 +136,7 @@ def test_a_script_gives_an_order_and_ends_when_it_is_obeyed(bench):
     assert done.stdout.startswith("said: leave 12\nobeyed by all within ")
     assert [drone.animal for drone in bench.drones] == [11, -1]
     status = bench.boat("--status")
-    assert "drones 1 RENDEZVOUS over 11, 2 RENDEZVOUS" in status.stdout
+    assert "drones 1 MONITOR over 11, 2 MONITOR" in status.stdout
     assert "pod found at 15.30036, -61.50000: 40 m north" in status.stdout
 
 
@@ -195,6 +195,7 @@ def test_what_is_no_order_is_told_before_anything_is_sent(bench):
         (" return all ", Spoken(operator_t.RETURN)),
         ("land 1", Spoken(operator_t.LAND, 1)),
         ("leave 0", Spoken(operator_t.LEAVE, 0, 0)),
+        ("watch 12", Spoken(operator_t.WATCH, 0, 12)),
     ],
 )
 def test_what_is_typed(line, order):
@@ -203,7 +204,7 @@ def test_what_is_typed(line, order):
 
 
 @pytest.mark.parametrize(
-    "line", ["", "hold 3", "hold two", "hold 1 2", "leave", "leave -1", "leave 255", "go"]
+    "line", ["", "hold 3", "hold two", "hold 1 2", "leave", "leave -1", "leave 255", "watch", "go"]
 )
 def test_what_is_no_order(line):
     with pytest.raises(OrderError):

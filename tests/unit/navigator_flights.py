@@ -94,7 +94,7 @@ class Fleet:
         self.visible = True
         self.agrees = True  # what the stand-in registrar answers
         self.command = 0
-        self.order_animal = -1
+        self.left: tuple[int, ...] = ()
         self.drones = [self._drone(entry) for entry in settings.drones]
         self.rows: list[podwatch.fleet_row_t] = []
         self.rows_utime = 0
@@ -207,9 +207,8 @@ class Fleet:
         fleet = None
         if self.rows_utime:
             fleet = make(podwatch.fleet_state_t, utime=self.rows_utime, n_rows=len(self.rows), rows=self.rows)
-            fleet.order = make(
-                podwatch.operator_t, utime=self.utime, command=self.command, animal=self.order_animal
-            )
+            fleet.order = make(podwatch.operator_t, utime=self.utime, command=self.command)
+            fleet.n_left, fleet.left = len(self.left), self.left
         return Inputs(
             self.utime,
             self._vehicle(drone),

@@ -12,11 +12,9 @@ from drivers.radios.memory import MemoryEther
 from lcmtypes import channels, make
 from lcmtypes.podwatch import (
     assignment_t,
-    fleet_state_t,
     identities_t,
     map_animal_t,
     mission_state_t,
-    operator_t,
     ring_assign_t,
     vehicle_state_t,
 )
@@ -25,8 +23,12 @@ from procs.assigner.solve import assign
 from procs.navigator.states import State
 from procs.queue_executor import ClockError, EventQueue, QueueRuntime, VirtualBus
 from procs.relay import process as relay
-from procs.relay.keys import make_key
+from procs.relay.keys import make_key, read_key
+from procs.relay.members import BOAT_ID
+from procs.relay.relay import TICK_S
 from procs.settings import AssignSettings, DroneEntry, DroneSettings, Mission
+from tools.boat.core import Boat
+from tools.boat.orders import parse
 
 S = 1_000_000
 Places = dict[int, tuple[float, float]]
@@ -52,7 +54,6 @@ class Fleet:
         self.told: dict[int, list[assignment_t]] = {drone_id: [] for drone_id in places}
         self.buses: dict[int, VirtualBus] = {}
         self.runtimes: dict[int, list[QueueRuntime]] = {}
-        self.order = make(operator_t, command=operator_t.NONE, animal=-1)
         self.largest_packet = 0
         self.follows = True  # the navigators say that they watch what they are given
         for drone_id in places:
@@ -65,7 +66,7 @@ class Fleet:
     def _start(self, drone_id: int, run_dir: Path) -> None:
         settings = DroneSettings(drone_id=drone_id, mission=self.mission, run_dir=str(run_dir))
         bus = self.buses[drone_id] = VirtualBus(self.queue)
-        drivers = {"radio": lambda _process: self.ether.radio(drone_id, self.mission.roster)}
+        drivers = {"radio": lambda _process: self.ether.radio(drone_id, (BOAT_ID, *self.mission.roster))}
         self.runtimes[drone_id] = []
         for name, module in (("relay", relay), ("assigner", assigner)):
             runtime = QueueRuntime(name, settings, bus, ClockError(10 * S), drivers)
@@ -101,6 +102,20 @@ class Fleet:
                 mission = make(mission_state_t, state=self.state[drone_id], animal=self.animal[drone_id])
                 self.say(drone_id, channels.MISSION_STATE, mission)
             self.queue.run_until(self.queue.now_us + S // 10)
+
+    def boat(self, run_dir: Path) -> Boat:
+        """A boat that hears them all."""
+        radio = self.ether.radio(BOAT_ID, self.mission.roster)
+        boat = Boat(self.mission, read_key(run_dir / "fleet.key"), radio, self.queue.now_us)
+        radio.on_arrival(lambda: boat.hear(self.queue.now_us))
+
+        def tick() -> None:
+            boat.tick(self.queue.now_us)
+            self._after(TICK_S, tick)
+
+        tick()
+        self.run(3.0)
+        return boat
 
     def episode(self, number: int, animals: Places, members: list[int] | None = None) -> None:
         """All registrars name these animals, ids with their places in metres north and east."""
@@ -225,18 +240,22 @@ def test_animals_change_hands_only_for_a_gain_and_never_twice_held(run_dir: Path
     assert fleet.animals() == {1: 103, 2: 102, 3: 101}
 
 
-def test_an_order_to_leave_passes_the_animal_on(run_dir: Path) -> None:
+def test_an_animal_that_the_boat_wants_left_is_taken_by_nobody_until_it_may_be_watched_again(
+    run_dir: Path,
+) -> None:
     fleet = Fleet(run_dir, line(2))
-    fleet.episode(1, beside(fleet.places))
+    animals = {101: (20.0, 3.0), 102: (40.0, 3.0), 103: (20.0, 12.0)}
+    boat = fleet.boat(run_dir)
+    fleet.episode(1, animals)
     fleet.run(3.0)
     assert fleet.animals() == {1: 101, 2: 102}
-    order = make(operator_t, command=operator_t.LEAVE, animal=101, utime=1, expiry_s=60)
-    state = make(fleet_state_t, members=3, order=order)
-    fleet.say(1, channels.FLEET_STATE, state)
-    fleet.episode(2, beside(fleet.places))
-    fleet.run(4.0)
-    assert fleet.animals() == {1: 102, 2: 101}
-    assert all(told.certified for told in fleet.last().values())
+    for number, order, expected in ((2, "leave 101", 103), (3, "watch 101", 101)):
+        boat.say(parse(order, fleet.mission.roster), fleet.queue.now_us)
+        fleet.run(3.0)
+        fleet.episode(number, animals)
+        fleet.run(4.0)
+        assert fleet.animals() == {1: expected, 2: 102}
+        assert all(told.certified for told in fleet.last().values())
 
 
 def test_minutes_already_watched_make_an_animal_dearer_for_all(run_dir: Path) -> None:

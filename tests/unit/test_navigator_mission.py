@@ -225,12 +225,11 @@ def test_an_order_is_obeyed_at_once(command: int, state: State) -> None:
 
 def test_an_order_to_leave_an_animal_lets_go_of_it() -> None:
     fleet = flown_to(State.MONITOR, n=1)
-    fleet.command, fleet.order_animal = podwatch.operator_t.LEAVE, fleet.drone(1).navigator.memory.animal
-    left = fleet.order_animal
+    left = fleet.drone(1).navigator.memory.animal
+    fleet.left = (left,)
     fleet.run(1.0)
     assert fleet.drone(1).navigator.state == State.STANDBY, "it makes way, and nobody gathers for that"
     assert fleet.drone(1).navigator.memory.animal == -1
-    fleet.command = podwatch.operator_t.NONE
     fleet.run(20.0)
     assert fleet.drone(1).navigator.memory.animal != left, "its old certificate gives it back to nobody"
 

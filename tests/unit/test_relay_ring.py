@@ -260,6 +260,31 @@ def test_the_boats_order_reaches_everybody_and_expires() -> None:
     assert fleet.members() == [0b1111] * 4
 
 
+def test_what_the_boat_says_of_an_animal_stands_beside_what_each_drone_is_to_fly() -> None:
+    """A drone on hold hears that its animal is to be left; the newest word on an animal holds."""
+    fleet = Fleet(4, boat=True)
+    fleet.run(8)
+
+    def say(*order: int) -> None:
+        fleet[0].core.fleet.order(Order(fleet[0].fleet_us, *order))
+        fleet.run(3)
+
+    def left() -> list[list[int]]:
+        return [list(drone.state.left) for drone in fleet.living]
+
+    say(operator_t.LEAVE, 0, 7, 60)
+    say(operator_t.HOLD, 3, -1, 60)
+    say(operator_t.LEAVE, 0, 2, 60)
+    assert left() == [[2, 7]] * 4
+    orders = [drone.state.order.command for drone in fleet.living]
+    assert orders == [operator_t.NONE, operator_t.NONE, operator_t.HOLD, operator_t.NONE]
+    say(operator_t.WATCH, 0, 7, 60)
+    assert left() == [[2]] * 4
+    fleet[0].die()
+    fleet.run(70)
+    assert left() == [[]] * 4
+
+
 def test_the_same_seed_gives_the_same_datagrams() -> None:
     def traffic(seed: int) -> list[bytes]:
         fleet, sent = Fleet(3, loss=0.2, seed=seed), []

@@ -7,6 +7,7 @@ from hypothesis import assume, given
 from hypothesis import settings as cases
 from hypothesis import strategies as st
 
+from lcmtypes.podwatch import operator_t
 from procs.relay import datagram
 from procs.relay.clock_sync import FleetOffer
 from procs.relay.datagram import Body, ClockPart, DatagramError, MessagePart
@@ -143,6 +144,15 @@ def test_a_table_is_within_its_limit_and_comes_back_whole_in_time(said: list[Row
         sink.merge(1, data, 1_000_000)
     assert [row.id for row in sink.rows((), 1_000_000)] == list(range(1, len(said) + 1))
     assert sink.order_for(n_orders, 1_000).utime_us == (999 + n_orders if n_orders else 0)
+
+
+def test_more_orders_than_one_table_holds_all_arrive_in_turn() -> None:
+    source, sink = FleetTable(1, (0, 1, 2)), FleetTable(2, (0, 1, 2))
+    for animal in range(12):
+        source.order(Order(1000 + animal, operator_t.LEAVE, 0, animal, 60))
+    for _ in range(7):
+        sink.merge(1, source.pack(2, 1_000_000), 1_000_000)
+    assert sink.left(1_000) == list(range(12))
 
 
 def test_a_row_of_an_earlier_life_of_a_drones_clock_does_not_come_back() -> None:

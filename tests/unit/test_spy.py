@@ -1,6 +1,5 @@
 """The spy's cores: exact figures at given times, messages from fragments, the ring as it is told."""
 
-import json
 from typing import Any
 
 import pytest
@@ -20,8 +19,6 @@ from lcmtypes.podwatch import (
 )
 from logs.sequence import GapCounter
 from procs.relay.link import NEVER_MS
-from procs.settings import DroneSettings, Mission, RadioSettings
-from tools.spy.cap import radio_cap
 from tools.spy.datagrams import parse_url
 from tools.spy.listener import decode
 from tools.spy.packets import FRAGMENT_HEAD, Fragments
@@ -238,10 +235,10 @@ def test_the_ring_shows_whom_each_drone_believes_and_what_each_link_carries():
     ring.hear_fleet(fleet_state(2, 0b111, {2: 0, 1: 0.2}, left_id=1, right_id=3, is_line=True), 10 * S)
     link = make(
         link_t, peer_id=2, up=True, age_ms=120, loss=0.05, round_trip_us=8000, n_dropped=4, n_rejected=2,
-        n_kinds=2, kinds=["link", "RING_MAP"], bytes_out=[440, 560],
+        cap_bytes_s=2000, n_kinds=2, kinds=["link", "RING_MAP"], bytes_out=[440, 560],
     )  # fmt: skip
     ring.hear_links(link_state(1, link, make(link_t, peer_id=0, age_ms=NEVER_MS)), 10 * S)
-    text = text_of(ring_page(ring, 2000, "by a test", 11 * S, 100))
+    text = text_of(ring_page(ring, 11 * S, 100))
     lines = [line.split() for line in text.splitlines()]
     assert ["1", "·", "0.4", "2", "‹", "1", "›", "2,", "ring", "of", "2"] in lines
     assert [
@@ -261,10 +258,9 @@ def test_the_ring_shows_whom_each_drone_believes_and_what_each_link_carries():
         "a",
         "position",
     ] in lines
-    assert ["1", "→", "2", "up", "0.1", "5%", "8.0", "1000", "50%", "4", "2"] in lines
+    assert ["1", "→", "2", "up", "0.1", "5%", "8.0", "1000", "2000", "50%", "4", "2"] in lines
     assert ["RING_MAP", "560,", "link", "440"] in lines
-    assert ["1", "→", "boat", "down", "never", "0%", "0.0", "0", "0%", "0", "0"] in lines
-    assert "each may send 2000 bytes/s (by a test)" in text
+    assert ["1", "→", "boat", "down", "never", "0%", "0.0", "0", "0", "0%", "0", "0"] in lines
 
 
 def test_what_is_old_is_not_told_as_if_it_were_so():
@@ -277,23 +273,10 @@ def test_what_is_old_is_not_told_as_if_it_were_so():
     assert ring.links(14 * S) == []
     assert ring.silent(14 * S) == {1: 4.0}
     assert ring.known_ids() == [1, 2, 3]
-    assert "silent for 4 s" in text_of(ring_page(ring, 2000, "", 14 * S, 100))
+    assert "silent for 4 s" in text_of(ring_page(ring, 14 * S, 100))
 
 
 def test_a_peer_that_was_never_heard_has_no_age():
     ring = Ring()
     ring.hear_links(link_state(1, make(link_t, peer_id=2, age_ms=NEVER_MS)), 0)
     assert ring.links(0)[0].age_s >= NEVER_S
-
-
-def test_the_cap_is_that_of_the_mission_that_the_processes_were_told(tmp_path):
-    mission = Mission(radio=RadioSettings(bytes_per_s=4321))
-    path = tmp_path / "drone_1.json"
-    path.write_text(json.dumps(DroneSettings(drone_id=1, mission=mission).model_dump(mode="json")))
-    beat = make(heartbeat_t, pid=77)
-    commands = {77: ["python", "-m", "procs.main", "relay", str(path)]}
-    assert radio_cap([beat], lambda pid: commands[pid]) == (4321, "by its mission")
-    cap, source = radio_cap([beat], lambda _: ["python", str(tmp_path / "gone.json")])
-    assert cap == RadioSettings().bytes_per_s
-    assert "--mission" in source
-    assert radio_cap([make(heartbeat_t, pid=2**30)])[0] == cap

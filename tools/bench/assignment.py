@@ -11,13 +11,11 @@ seeds.
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from rich.console import Console
-
 from tools.bench import assignment_bars as bars
 from tools.bench import assignment_flight as flight
 from tools.bench import assignment_large as large
 from tools.bench.assignment_figures import draw
-from tools.bench.table import Row, measured, print_table, write_table
+from tools.bench.table import Row, bench_console, measured, print_table, write_table
 
 __all__ = ["command"]
 
@@ -35,7 +33,7 @@ def command(seed: int, cases: int, out: Path, *, quick: bool, draw_into: Path | 
     cases: of each size up to 12 agents. quick: few cases a size, for a look and for tests. draw_into: folder
     of the figures, `out` where None.
     """
-    console = Console()
+    console = bench_console()
     count = min(cases, QUICK_CASES) if quick else cases
     measures = bars.Measures(seed, count)
     rings = large.LargeRings(seed, quick=quick)

@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.live import Live
 
 from lcmtypes import channels
-from tools.bench.table import Row, measured, print_table, write_table
+from tools.bench.table import Row, bench_console, measured, print_table, write_table
 from tools.spy.command import DRAIN_S, REDRAW_S, render
 from tools.spy.session import Session
 
@@ -38,7 +38,7 @@ SPOKEN = (
 
 def command(out: Path, seconds: float = SECONDS) -> None:
     """Measure, print the table, and write it as bench_bus.json into `out`."""
-    console = Console()
+    console = bench_console()
     with console.status("spy"):
         rows = measured(spy_rows(seconds), "spy")
     print_table("podwatch bench bus", rows, console)

@@ -11,12 +11,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Console
 
 from lcmtypes import channels
 from logs.reader import read
 from procs import processes
-from tools.bench.table import Row, measured, print_table, write_table
+from tools.bench.table import Row, bench_console, measured, print_table, write_table
 from tools.folders import new_folder
 from tools.sim.command import read_mission, with_overrides
 from tools.sim.lockstep import LockstepFleet
@@ -34,7 +33,7 @@ MOST_ANIMALS = 20
 
 def command(seeds: int, out: Path, *, quick: bool) -> None:
     """Measure all, print the table, and write it as bench_fleet.json into `out`."""
-    console = Console()
+    console = bench_console()
     sensor = "boxes" if quick else "pixels"
     groups: list[tuple[str, Callable[[], Iterator[Row]]]] = [
         ("default mission", lambda: default_missions(seeds, out, sensor)),

@@ -15,7 +15,6 @@ from pathlib import Path
 
 import lcm
 import numpy as np
-from rich.console import Console
 
 from lcmtypes import channels, make
 from lcmtypes.podwatch import link_state_t, link_t, log_state_t, preview_t, track_t
@@ -23,7 +22,7 @@ from logs.fleet import Fleet
 from logs.scan import Scan
 from logs.writer import LogWriter
 from procs.settings import DroneSettings, Mission
-from tools.bench.table import Row, measured, print_table, write_table
+from tools.bench.table import Row, bench_console, measured, print_table, write_table
 from tools.playback.player import Player
 from tools.playback.selection import Selection
 
@@ -49,7 +48,7 @@ def command(out: Path, seconds: float = FLOOD_S, *, real_time: bool = False) -> 
     real_time: what is measured goes before all else that the machine does, as if it had nothing else to do.
     Raises PermissionError where this user may not ask for that.
     """
-    console = Console()
+    console = bench_console()
     if real_time:
         os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
     groups: list[tuple[str, Callable[[], Iterator[Row]]]] = [

@@ -4,12 +4,9 @@ Every trial has a generator of its own, made from the seed, the cell's name and 
 gives the same figure alone and among all, on one processor and on many.
 """
 
-import sys
 import time
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-
-from rich.console import Console
 
 from tools.bench.registration_cells import EPISODES, MONITOR, PAIRS, PROMISES, RINGS, row_of
 from tools.bench.registration_monitor import monitor_counts
@@ -19,7 +16,7 @@ from tools.bench.registration_rings import episode_counts, is_ring_right, ring_c
 from tools.bench.registration_scenes import CAMERA, IMAGE_SIZE, Cell, View, draw_views, true_matches
 from tools.bench.registration_speed import speed_rows
 from tools.bench.registration_tasks import Task, count_all, in_chunks, rows_of_part, together
-from tools.bench.table import Row, print_table, write_table
+from tools.bench.table import Row, bench_console, print_table, write_table
 
 __all__ = [
     "CAMERA",
@@ -40,12 +37,11 @@ MOST_PEER_PAIRS = 100
 RINGS_A_SEQUENCE = 4  # a sequence of episodes costs about as much as this many rings
 TIMED = ("full view N=5", "full view N=9", "full view N=20")
 SPEED, PEERS, FIGURE, PIXELS = "speed", "peers", "figure", "real pixels"
-PRINTED_WIDTH = 150  # in a file or a pipe
 
 
 def command(pairs: int, rings: int, seed: int, only: str, out: Path) -> None:
     """Measure, print the tables, write the rows as JSON and the figures as PNG into `out`."""
-    console = Console(width=None if sys.stdout.isatty() else PRINTED_WIDTH)
+    console = bench_console()
     began = time.monotonic()
     out.mkdir(parents=True, exist_ok=True)
     promises = [promise for promise in PROMISES if only.lower() in promise.name.lower()]

@@ -1,6 +1,7 @@
 """The table that every benchmark prints: one row a promise, MISSING where there is no figure."""
 
 import json
+import sys
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -8,7 +9,9 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-__all__ = ["Row", "measured", "print_table", "write_table"]
+__all__ = ["Row", "bench_console", "measured", "print_table", "write_table"]
+
+PRINTED_WIDTH = 150  # in a file or a pipe
 
 
 @dataclass(frozen=True)
@@ -23,6 +26,11 @@ class Row:
     aim: str = ""
     passed: bool | None = None  # of the floor; None where there is none
     why: str = ""  # said below the table
+
+
+def bench_console() -> Console:
+    """Where a benchmark prints: as wide as the terminal, and wide enough where there is none."""
+    return Console(width=None if sys.stdout.isatty() else PRINTED_WIDTH)
 
 
 def measured(rows: Iterable[Row], name: str) -> list[Row]:

@@ -14,13 +14,14 @@ from tools.boat.orders import BoatError, Spoken
 __all__ = ["Boat", "Given"]
 
 S = 1_000_000
-# How long an order holds, s. One to hold outlasts a lost boat, not the day.
+# How long an order holds, s. One to hold outlasts a lost boat, not the day; one to leave an animal does both.
 EXPIRY_S = {
     operator_t.START: 30,
     operator_t.HOLD: 1800,
     operator_t.RETURN: 60,
     operator_t.LAND: 60,
-    operator_t.LEAVE: 30,
+    operator_t.LEAVE: 6 * 3600,
+    operator_t.WATCH: 6 * 3600,
 }
 ON_GROUND = (State.IDLE, State.LANDED)
 
@@ -89,12 +90,8 @@ class Boat:
             raise BoatError("no drone hears the boat yet: an order would reach nobody; wait for the link")
         fleet_us = now_us + int(state.fleet_offset_us)
         order = Order(fleet_us, spoken.command, spoken.target, spoken.animal, EXPIRY_S[spoken.command])
-        standing = self._standing(fleet_us) if spoken.command == operator_t.LEAVE else []
         self._relay.order(order, now_us)
         self.given.append(Given(spoken, order, now_us))
-        for kept in standing:  # one for everybody ends those for one: these hold on
-            again = Order(fleet_us + 1, kept.command, kept.target, -1, kept.expiry_s)
-            self._relay.order(again, now_us)
         return self.given[-1]
 
     def left_to_obey(self, given: Given, now_us: int) -> list[int]:
@@ -103,18 +100,6 @@ class Boat:
         told = [given.spoken.target] if given.spoken.target else list(rows)
         living = [rows[drone_id] for drone_id in told if drone_id in rows and rows[drone_id].alive]
         return [row.id for row in living if not _obeys(given.spoken, row)]
-
-    def _standing(self, fleet_us: int) -> list[Order]:
-        """Orders for one drone alone that are in force and not taken back since."""
-        newest: dict[int, Order] = {}
-        for given in self.given:
-            if given.spoken.command == operator_t.LEAVE:
-                continue
-            if given.spoken.target == 0:
-                newest.clear()
-            else:
-                newest[given.spoken.target] = given.order
-        return [order for order in newest.values() if order.is_valid(fleet_us)]
 
 
 def _obeys(spoken: Spoken, row: fleet_row_t) -> bool:
@@ -125,6 +110,8 @@ def _obeys(spoken: Spoken, row: fleet_row_t) -> bool:
         return state in (State.HOLD, *ON_GROUND)
     if spoken.command == operator_t.LEAVE:
         return int(row.animal) != spoken.animal
+    if spoken.command == operator_t.WATCH:
+        return True  # it may be watched; who does is for the fleet to agree
     if spoken.command == operator_t.LAND:
         return state in (State.LAND, *ON_GROUND)
     return state in (State.RETURN, State.LAND, *ON_GROUND)

@@ -1,4 +1,5 @@
-"""What a person types on the boat, and what it means: `start`, `hold 2`, `return`, `land 1`, `leave 3`."""
+"""What a person types on the boat, and what it means: `start`, `hold 2`, `return`, `land 1`, `leave 3`,
+`watch 3`."""
 
 import difflib
 from collections.abc import Sequence
@@ -8,14 +9,16 @@ from lcmtypes.podwatch import operator_t
 
 __all__ = ["HELP", "BoatError", "OrderError", "Spoken", "parse"]
 
-HELP = "start [drone] | hold [drone] | return [drone] | land [drone] | leave <animal> | quit"
+HELP = "start [drone] | hold [drone] | return [drone] | land [drone] | leave <animal> | watch <animal> | quit"
 COMMANDS = {
     "start": operator_t.START,
     "hold": operator_t.HOLD,
     "return": operator_t.RETURN,
     "land": operator_t.LAND,
     "leave": operator_t.LEAVE,
+    "watch": operator_t.WATCH,
 }
+ABOUT_ANIMALS = (operator_t.LEAVE, operator_t.WATCH)
 MOST_ANIMAL = 254
 
 
@@ -29,7 +32,7 @@ class OrderError(ValueError):
 
 @dataclass(frozen=True)
 class Spoken:
-    """An order as it was typed. target: a drone's id, 0 for all. animal: for leave, -1 else."""
+    """An order as it was typed. target: a drone's id, 0 for all. animal: for leave and watch, -1 else."""
 
     command: int
     target: int = 0
@@ -37,7 +40,7 @@ class Spoken:
 
     def __str__(self) -> str:
         word = next(word for word, command in COMMANDS.items() if command == self.command)
-        if self.command == operator_t.LEAVE:
+        if self.command in ABOUT_ANIMALS:
             return f"{word} {self.animal}"
         return f"{word} {self.target}" if self.target else f"{word} (all)"
 
@@ -49,9 +52,9 @@ def parse(line: str, roster: Sequence[int]) -> Spoken:
         near = difflib.get_close_matches(words[0] if words else "", COMMANDS, n=1)
         raise OrderError(f"{line.strip()!r} is no order{f'; {near[0]}?' if near else ''}. There are: {HELP}")
     command = COMMANDS[words[0]]
-    if command == operator_t.LEAVE:
+    if command in ABOUT_ANIMALS:
         if len(words) != 2 or not words[1].isdigit() or int(words[1]) > MOST_ANIMAL:
-            raise OrderError(f"{line.strip()!r}: say which animal, by its number in the table: leave 3")
+            raise OrderError(f"{line.strip()!r}: say which animal, by its number in the table: {words[0]} 3")
         return Spoken(command, animal=int(words[1]))
     if len(words) == 1 or (len(words) == 2 and words[1] == "all"):
         return Spoken(command)

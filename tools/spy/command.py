@@ -2,7 +2,6 @@
 
 import sys
 import time
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -36,9 +35,6 @@ def spy(
     text: Annotated[bool, typer.Option("--text", help="Plain lines, for scripts.")] = False,
     seconds: Annotated[float, typer.Option(min=0.1, help="With --text: how long to listen.")] = 3.0,
     count: Annotated[int, typer.Option(min=0, help="With --text: how many times; 0: until stopped.")] = 1,
-    mission: Annotated[
-        Path | None, typer.Option(help="The mission or fleet file that says how much a link may send.")
-    ] = None,
     gui: Annotated[bool, typer.Option("--gui", help="Start lcm-spy with our message types.")] = False,
 ) -> None:
     """Show what is said on a drone's bus: how often, how evenly, what is missing, the newest message.
@@ -46,7 +42,6 @@ def spy(
     The ring's page shows each link and whom each drone takes for living. With --text the exit code is 1 where
     nothing was heard.
     """
-    from procs.settings import Mission, load_mission
     from tools.buses import bus_url, taken_slots
     from tools.spy.datagrams import parse_url
     from tools.spy.session import Session
@@ -64,22 +59,20 @@ def spy(
 
         with plain_errors():
             raise typer.Exit(start(url or bus_url(drone, chosen)))
-    with plain_errors():
-        cap = None
-        if mission is not None:
-            cap = load_mission(mission, Mission).radio.bytes_per_s, f"by {mission.name}"
-        with Session(
+    with (
+        plain_errors(),
+        Session(
             lambda drone_id: url or bus_url(drone_id, chosen),
             drone,
             follows=url is None,
             patterns=channel or (),
-            cap=cap,
-        ) as session:
-            console = Console(highlight=False)
-            if text or not console.is_terminal:
-                _print_text(session, page, seconds, count, is_detailed=bool(channel))
-            else:
-                _show(session, page, console)
+        ) as session,
+    ):
+        console = Console(highlight=False)
+        if text or not console.is_terminal:
+            _print_text(session, page, seconds, count, is_detailed=bool(channel))
+        else:
+            _show(session, page, console)
 
 
 def _print_text(session: "Session", page: str, seconds: float, count: int, *, is_detailed: bool) -> None:
@@ -92,7 +85,7 @@ def _print_text(session: "Session", page: str, seconds: float, count: int, *, is
         while count == 0 or printed < count:
             _listen(session, seconds, looks_round=page == "ring")
             if page == "ring":
-                lines = ring_text(session.ring, *session.cap(), now_us())
+                lines = ring_text(session.ring, now_us())
             else:
                 lines = channel_text(session.listener, now_us(), is_detailed=is_detailed)
             sys.stdout.write("\n".join(lines) + "\n")
@@ -158,7 +151,7 @@ def render(session: "Session", page: str, selected: str, console: Console, scrol
     room = height - 1
     if page == "ring":
         session.look_round()
-        lines = ring_page(session.ring, *session.cap(), now_us(), width)
+        lines = ring_page(session.ring, now_us(), width)
         n_hidden = len(lines) - room + 1
         if n_hidden > 1:
             first = min(scrolled, n_hidden)

@@ -44,7 +44,7 @@ def channel_page(listener: Listener, selected: str, now_us: int, width: int, hei
     return [_cut(line, width) for line in lines]
 
 
-def ring_page(ring: Ring, cap_bytes_s: int, cap_source: str, now_us: int, width: int) -> list[Text]:
+def ring_page(ring: Ring, now_us: int, width: int) -> list[Text]:
     """Who lives by each drone's word, then each link with its bytes by kind."""
     beliefs, links = ring.beliefs(now_us), ring.links(now_us)
     ids = ring.known_ids()
@@ -56,11 +56,12 @@ def ring_page(ring: Ring, cap_bytes_s: int, cap_source: str, now_us: int, width:
     if not beliefs:
         lines.append(Text(" no FLEET_STATE heard", style=DOUBTFUL))
     lines.append(Text(""))
-    lines.append(Text(f"links: each may send {cap_bytes_s} bytes/s ({cap_source})", style=HEAD))
-    columns = f"{'age s':>7}{'loss':>6}{'trip ms':>9}{'bytes/s':>9}{'of cap':>8}{'dropped':>9}{'refused':>9}"
+    lines.append(Text("links: what each end says that it sends", style=HEAD))
+    columns = f"{'age s':>7}{'loss':>6}{'trip ms':>9}{'bytes/s':>8}{'cap':>7}{'of cap':>8}"
+    columns += f"{'dropped':>9}{'refused':>9}"
     lines.append(Text(f" {'link':<11}{'':5}{columns}", style=FAINT))
     for link in links:
-        lines += _link_lines(link, cap_bytes_s, is_wide=width >= WIDE)
+        lines += _link_lines(link, is_wide=width >= WIDE)
     if not links:
         lines.append(Text(" no LINK_STATE heard", style=DOUBTFUL))
     return [_cut(line, width) for line in lines]
@@ -136,15 +137,15 @@ def _belief_line(belief: Belief, ids: list[int]) -> Text:
     return line
 
 
-def _link_lines(link: LinkRow, cap_bytes_s: int, *, is_wide: bool) -> list[Text]:
+def _link_lines(link: LinkRow, *, is_wide: bool) -> list[Text]:
     ends = f"{link.drone_id} → {link.peer_id or 'boat'}"
     line = Text(f" {ends:<11}")
     line.append(f"{'up' if link.is_up else 'down':<5}", style=GOOD if link.is_up else BAD)
     line.append(f"{'never' if link.age_s >= NEVER_S else f'{link.age_s:.1f}':>7}")
     line.append(f"{link.loss:>6.0%}", style=DOUBTFUL if link.loss > HIGH_LOSS else "")
     line.append(f"{'-' if link.round_trip_ms >= NEVER_S else f'{link.round_trip_ms:.1f}':>9}")
-    load = link.total_bytes_s / cap_bytes_s
-    line.append(f"{link.total_bytes_s:>9}")
+    load = link.total_bytes_s / max(link.cap_bytes_s, 1)
+    line.append(f"{link.total_bytes_s:>8}{link.cap_bytes_s:>7}")
     line.append(f"{load:>8.0%}", style=DOUBTFUL if load > HIGH_LOAD else "")
     line.append(f"{link.n_dropped:>9}{link.n_rejected:>9}")
     kinds = [f"{kind} {n_bytes}" for kind, n_bytes in sorted(link.bytes_s.items()) if n_bytes]

@@ -22,6 +22,7 @@ class LinkRow:
     loss: float
     round_trip_ms: float
     bytes_s: dict[str, int]  # by kind, sent
+    cap_bytes_s: int
     n_rejected: int
     n_dropped: int
 
@@ -118,6 +119,7 @@ def _link_row(drone_id: int, link: link_t) -> LinkRow:
         float(link.loss),
         link.round_trip_us / 1000,
         {kind: int(n_bytes) for kind, n_bytes in kinds.items()},
+        link.cap_bytes_s,
         link.n_rejected,
         link.n_dropped,
     )

@@ -6,7 +6,6 @@ from contextlib import ExitStack
 from typing import Self
 
 from lcmtypes import channels
-from tools.spy.cap import radio_cap
 from tools.spy.listener import Listener
 from tools.spy.ring import Ring
 
@@ -26,12 +25,10 @@ class Session:
         *,
         follows: bool = True,
         patterns: Sequence[str] = (),
-        cap: tuple[int, str] | None = None,
     ) -> None:
         self._url_of, self._follows, self._patterns = url_of, follows, tuple(patterns)
         self._stack = ExitStack()
         self._listeners: dict[int, Listener] = {}
-        self._cap = cap
         self.ring = Ring()
         self.drone_id = drone_id
         self._open(drone_id)
@@ -77,17 +74,6 @@ class Session:
         self.look_round()
         ids = sorted(self._listeners)
         self.drone_id = ids[(ids.index(self.drone_id) + by) % len(ids)]
-
-    def cap(self) -> tuple[int, str]:
-        """(bytes/s that each link may send, where that is said)."""
-        if self._cap is None:
-            newest = (listener.newest(channels.HEARTBEAT) for listener in self._listeners.values())
-            beats = [beat for beat in newest if beat is not None and not isinstance(beat, bytes)]
-            found = radio_cap(beats)
-            if not beats:
-                return found  # asked again once a process has said who it is
-            self._cap = found
-        return self._cap
 
     def _open(self, drone_id: int) -> None:
         self._listeners[drone_id] = self._stack.enter_context(

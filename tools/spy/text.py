@@ -37,9 +37,9 @@ def channel_text(listener: Listener, now_us: int, *, is_detailed: bool) -> list[
     return lines
 
 
-def ring_text(ring: Ring, cap_bytes_s: int, cap_source: str, now_us: int) -> list[str]:
+def ring_text(ring: Ring, now_us: int) -> list[str]:
     """The ring's page without colour."""
-    return [line.plain.rstrip() for line in ring_page(ring, cap_bytes_s, cap_source, now_us, WIDE)]
+    return [line.plain.rstrip() for line in ring_page(ring, now_us, WIDE)]
 
 
 def _columns(cells: tuple[str, ...]) -> str:
