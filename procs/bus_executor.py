@@ -11,6 +11,7 @@ import os
 import select
 import signal
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import lcm
@@ -53,7 +54,10 @@ def load_driver(spec: DriverSpec) -> Any:
 class BusRuntime(Runtime):
     """One process on its drone's multicast group."""
 
-    def __init__(self, process: str, settings: DroneSettings) -> None:
+    def __init__(self, process: str, settings: DroneSettings, settings_path: Path | None = None) -> None:
+        """`settings_path`: where SIGHUP finds new ones."""
+        self._settings_path = settings_path
+        self._reload_asked = False
         self._clock = load_driver(settings.drivers.get("clock", DEFAULT_CLOCK))
         self._now: int = self._clock.utime()
         super().__init__(process, settings)
@@ -127,10 +131,14 @@ class BusRuntime(Runtime):
         self._running = False
 
     def run(self) -> None:
-        """Run until a SIGTERM or SIGINT, then run the stop handlers."""
+        """Run until a SIGTERM or SIGINT, then run the stop handlers. SIGHUP reads the settings again
+        where a handler wants them.
+        """
         signal.set_wakeup_fd(self._wake_write)
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, self._signalled)
+        if self._reload_handlers:
+            signal.signal(signal.SIGHUP, self._ask_reload)
         self._now = self._clock.utime()
         for timer in self._timers:  # a slow setup is no lateness
             timer.due_utime = self._now + timer.period_us
@@ -140,6 +148,7 @@ class BusRuntime(Runtime):
             self._wait()
             self._drain()
             self._read_transports()
+            self._reload_if_asked()
             self._run_due()
         self._notifier.stopping()
         self._stop()
@@ -151,6 +160,16 @@ class BusRuntime(Runtime):
     def _signalled(self, _number: int, _frame: object) -> None:
         self._running = False
         signal.setitimer(signal.ITIMER_REAL, HARD_STOP_S)
+
+    def _ask_reload(self, _number: int, _frame: object) -> None:
+        self._reload_asked = True
+
+    def _reload_if_asked(self) -> None:
+        if not self._reload_asked:
+            return
+        self._reload_asked = False
+        path = self._settings_path
+        self._reload(lambda: DroneSettings.read(path) if path is not None else self.settings)
 
     def _wait(self) -> None:
         """Wait until the bus, a transport, a signal or the next timer has something for us."""

@@ -34,7 +34,9 @@ def main() -> None:
     if arguments.end_with_parent:
         end_with_parent()
     try:
-        runtime = BusRuntime(arguments.process, DroneSettings.read(arguments.settings))
+        runtime = BusRuntime(
+            arguments.process, DroneSettings.read(arguments.settings), arguments.settings.absolute()
+        )
         importlib.import_module(processes.BY_NAME[arguments.process].module).setup(runtime)
     except (RuntimeFailure, MissionError, OSError) as error:
         sys.stderr.write(f"{arguments.process}: {error}\n")

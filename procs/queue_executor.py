@@ -143,6 +143,11 @@ class QueueRuntime(Runtime):
         self._beat()
         self._flush(0)
 
+    def reload(self, settings: DroneSettings) -> None:
+        """Put new settings in force now."""
+        self._began_us = self._queue.now_us
+        self._reload(lambda: settings)
+
     def kill(self) -> None:
         """End at once, without stop handlers, as kill -9 does."""
         self._alive = False

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 from lcmtypes import channels, make
 from lcmtypes.podwatch import heartbeat_t
 from logs.sequence import GapCounter
-from procs.settings import DroneSettings
+from procs.settings import DroneSettings, MissionError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -75,6 +75,7 @@ class Runtime(ABC):
         self._raw_handler: RawHandler | None = None
         self._timers: list[Timer] = []
         self._stop_handlers: list[Callable[[], None]] = []
+        self._reload_handlers: list[Callable[[], None]] = []
         self._sequence: dict[str, int] = {}
         self._arrivals = 0
         self._trouble: dict[str, str] = {}
@@ -146,6 +147,10 @@ class Runtime(ABC):
     def on_stop(self, handler: Callable[[], None]) -> None:
         """Call `handler()` once when the process is asked to end."""
         self._stop_handlers.append(handler)
+
+    def on_reload(self, handler: Callable[[], None]) -> None:
+        """Call `handler()` when somebody wants new settings in force; `settings` are the new ones by then."""
+        self._reload_handlers.append(handler)
 
     def publish(self, channel: str, message: Any) -> None:
         """Say `message`; drone_id and seq are filled in, and utime where it is 0."""
@@ -261,6 +266,19 @@ class Runtime(ABC):
         self._late_us = 0
         for cause in [cause for cause in self._trouble if cause.startswith("decode ")]:
             del self._trouble[cause]
+
+    def _reload(self, read: Callable[[], DroneSettings]) -> None:
+        """Put new settings in force for the handlers that asked; those that cannot be read change nothing."""
+        if not self._reload_handlers:
+            return
+        try:
+            self.settings = read()
+        except MissionError as error:
+            self.degraded(f"{error}; the old settings stay in force", cause="reload settings")
+            return
+        self.ok("reload settings")
+        for handler in self._reload_handlers:
+            handler()
 
     def _stop(self) -> None:
         """Run the stop handlers, last registered first."""

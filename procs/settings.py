@@ -18,6 +18,7 @@ __all__ = [
     "AssignSettings",
     "BoatSettings",
     "CameraSettings",
+    "DetectorSettings",
     "DriverSpec",
     "DroneSettings",
     "LimitSettings",
@@ -28,6 +29,7 @@ __all__ = [
     "RadioSettings",
     "SearchSettings",
     "WatchSettings",
+    "beside",
     "load_mission",
 ]
 
@@ -36,6 +38,7 @@ MAX_DRONES = 63  # members travel as a bitmap of 64 bits, signed
 LEAST_HOME_SPACING_M = 3.0  # nearer homes let two drones land on each other
 # A drone never flies nearer to its fence: what lies beyond is never reached (AUTOPILOT fact 11).
 FENCE_KEPT_M = 3.0
+LEAST_TILE_PX = 32
 
 
 class MissionError(Exception):
@@ -67,6 +70,36 @@ class CameraSettings(Section):
     rate_hz: float = Field(20.0, ge=1, le=60)
     preview_hz: float = Field(2.0, ge=0.2, le=5)
     detect_hz: float = Field(5.0, ge=0.5, le=30)
+
+
+class DetectorSettings(Section):
+    """The model that finds animals, and how it is used."""
+
+    model: str = ""  # an ONNX file, from the fleet file's folder; empty: the one that ships
+    confidence: float = Field(0.25, ge=0.01, le=1)  # least score
+    iou: float = Field(0.45, ge=0, le=1)  # of two boxes that overlap by more the lesser goes
+    classes: tuple[int | str, ...] = ()  # numbers or names of the model's classes; empty: all
+    tile: int | Literal["auto", "off"] = "auto"  # auto: where animals are too small; a number: px, always
+    tile_limit_ms: float = Field(100.0, ge=1, le=5000)  # that a tiled frame may take where tile is auto
+    provider: Literal["cpu", "cuda", "tensorrt", "openvino"] = "cpu"
+
+    @model_validator(mode="after")
+    def _known_tile(self) -> Self:
+        if isinstance(self.tile, int) and not LEAST_TILE_PX <= self.tile <= 8192:
+            raise ValueError(f'tile = {self.tile}: "auto", "off", or {LEAST_TILE_PX} to 8192 px')
+        return self
+
+    def options(self) -> dict[str, Any]:
+        """Arguments of `procs.detector.yolo.Detector`."""
+        return {
+            "model_path": self.model or None,
+            "confidence": self.confidence,
+            "iou": self.iou,
+            "classes": list(self.classes) or None,
+            "tile": None if self.tile == "off" else self.tile,
+            "tile_limit_ms": self.tile_limit_ms,
+            "provider": self.provider,
+        }
 
 
 class SearchSettings(Section):
@@ -167,6 +200,7 @@ class BoatSettings(Section):
     """The boat, roster member 0."""
 
     radio: str = Field("", pattern=r"^([^\s:]+:\d{1,5})?$")  # where the drones reach it; empty: there is none
+    lost_return_s: float = Field(0.0, ge=0, le=3600)  # silent for so long, it is lost: home. 0: they fly on
     drivers: dict[str, DriverSpec] = {}  # its clock, where that is not the machine's
 
 
@@ -186,6 +220,7 @@ class Mission(Section):
     origin: OriginSettings = OriginSettings()
     drones: tuple[DroneEntry, ...] = tuple(DroneEntry(id=i, home_e_m=10.0 * (i - 1)) for i in (1, 2, 3))
     camera: CameraSettings = CameraSettings()
+    detector: DetectorSettings = DetectorSettings()
     search: SearchSettings = SearchSettings()
     watch: WatchSettings = WatchSettings()
     assign: AssignSettings = AssignSettings()
@@ -300,6 +335,14 @@ def load_mission(path: Path, model: type[S]) -> S:
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise MissionError(f"{path}: not valid TOML: {error}") from error
     return validate(data, model, str(path))
+
+
+def beside(path: Path, mission: S) -> S:
+    """`mission` with the place of its model made absolute: from the folder of its file `path`."""
+    if not mission.detector.model:
+        return mission
+    model = str(path.resolve().parent / mission.detector.model)
+    return mission.model_copy(update={"detector": mission.detector.model_copy(update={"model": model})})
 
 
 def validate(data: dict[str, Any], model: type[S], source: str) -> S:

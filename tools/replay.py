@@ -52,7 +52,7 @@ def replay_command(
         from tools.replaying.run import replay
 
         drone = DroneLog(log, warn)
-        done = replay(process, drone, _models(), _clock(drone))
+        done = replay(process, drone, _models(drone), _clock(drone))
         real = not done.is_virtual
         tolerance = Tolerance(
             round(1000 * (time_ms if time_ms is not None else REAL_TIME_MS * real)),
@@ -77,13 +77,17 @@ def _clock(drone: "DroneLog") -> "ClockError | None":
         return None
 
 
-def _models() -> dict[str, Any]:
+def _models(drone: "DroneLog") -> dict[str, Any]:
     """The models that look at pixels, made only where they are opened."""
 
     def detector() -> Any:
+        from procs import processes
         from procs.detector.yolo import Detector
+        from tools.replaying.run import settings_of
 
-        return Detector()
+        # A look takes its nominal time, as in a flight in virtual time.
+        nominal_ms = 1e3 * processes.BY_NAME["detector"].compute_s
+        return Detector(**settings_of(drone).mission.detector.options(), look_ms=nominal_ms)
 
     def tracker() -> Any:
         from procs.tracker.mask_tracker import MaskTracker

@@ -7,10 +7,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Candidates", "ModelError", "decode_finished", "decode_raw", "layout_of", "suppress"]
+__all__ = ["Candidates", "Layout", "ModelError", "best_first", "decode", "layout_of", "suppress"]
 
-MOST_BOXES = 300  # far above any pod; bounds the time that a shouting network can cost
-MOST_REFUSED_SHARE = 0.5  # of the output's rows that may be NaN or infinite before the model counts as broken
+MOST_BOXES = 300  # far above any pod
+MOST_CANDIDATES = 1000  # compared with each other: bounds the time that a shouting network can cost
+MOST_REFUSED_SHARE = 0.5  # of the output's rows that may be no numbers before the model counts as broken
+MOST_SCORE = 1.01  # half precision rounds up; a score above that was never a probability
+NORMALISED_BELOW = 2.0  # no finished box in pixels has all its numbers below this
 
 
 class ModelError(Exception):
@@ -18,91 +21,187 @@ class ModelError(Exception):
 
 
 class Candidates(NamedTuple):
-    """Boxes in the network's pixels."""
+    """Boxes in the pixels of what the network was shown."""
 
     boxes: NDArray[np.float32]  # (N, 4) xyxy
     scores: NDArray[np.float32]  # (N,)
     classes: NDArray[np.int64]  # (N,)
+    turned: NDArray[np.float32] | None = None  # (N, 5) centre x, y, width, height, angle rad: oriented boxes
 
     def take(self, rows: NDArray[np.bool_] | NDArray[np.int64]) -> "Candidates":
         """Those of `rows`, a mask or indices."""
-        return Candidates(self.boxes[rows], self.scores[rows], self.classes[rows])
+        turned = None if self.turned is None else self.turned[rows]
+        return Candidates(self.boxes[rows], self.scores[rows], self.classes[rows], turned)
+
+
+class Layout(NamedTuple):
+    """raw: (1, 4 + nc [+ 1], A), overlapping boxes. finished: (1, N, 6), or 7 where oriented, overlaps gone.
+    queries: RT-DETR's (1, N, 6) or (1, N, 4 + nc), overlaps gone, boxes as shares of the input's sides.
+    """
+
+    kind: Literal["raw", "finished", "queries"]
+    oriented: bool = False
 
 
 def layout_of(
-    shape: Sequence[int], class_count: int | None, task: str = "detect"
-) -> Literal["raw", "finished"]:
-    """Which layout an output of `shape` has; ValueError names the shape when it is neither.
+    shape: Sequence[int], class_count: int | None, task: str | None = None, head: str = ""
+) -> Layout:
+    """The layout of an output of `shape`; ValueError names the shape when it has none that is known.
 
-    raw: (1, 4 + nc, A), one more row for the angle of an oriented box. finished: (1, N, 6), or 7 with an
-    angle. The finished one is tried first: no network has 6 or 7 cells, but many have two or three classes.
+    class_count: None where the metadata names no classes. task, head: as the metadata says. The order of the
+    questions is that of docs/detector.md: RT-DETR's output looks like a finished one, and a finished one is
+    told from a raw one by its last dimension, since no network has six or seven cells.
     """
-    extra = 1 if task == "obb" else 0
+    oriented = task == "obb"
+    extra = 1 if oriented else 0
     if len(shape) == 3 and shape[0] == 1:
-        if shape[2] == 6 + extra:
-            return "finished"
-        rows = shape[1]
-        if (class_count is None and rows > 4 + extra) or rows == 4 + extra + (class_count or 0):
-            return "raw"
-    expected = "4 + classes" if class_count is None else str(4 + extra + class_count)
-    raise ValueError(f"output shape {tuple(shape)} is neither (1, {expected}, A) nor (1, N, {6 + extra})")
+        _, rows, columns = shape
+        if "DETR" in head.upper():
+            if columns == 6 or columns == 4 + (class_count or 0):
+                return Layout("queries")
+        elif columns == 7 and task != "detect":
+            return Layout("finished", oriented=True)
+        elif columns == 6 and not oriented:
+            return Layout("finished")
+        elif class_count is not None:
+            if rows == 4 + extra + class_count:
+                return Layout("raw", oriented)
+        elif rows > 4 + extra and not rows > max(columns, 100):  # more rows than cells: turned on its side
+            return Layout("raw", oriented)
+    expected = "4 + classes" if class_count is None else str(4 + class_count)
+    plus = " + 1" if oriented else ""
+    raise ValueError(
+        f"output shape {tuple(shape)} is neither (1, {expected}{plus}, A) nor (1, N, {6 + extra})"
+    )
 
 
-def _upright(boxes: NDArray[np.float32], angle_rad: NDArray[np.float32] | None) -> NDArray[np.float32]:
-    """(N, 4) centre x, y, width, height -> xyxy; an oriented box becomes the upright one round it."""
-    centre, size = boxes[:, :2], boxes[:, 2:4]
-    if angle_rad is not None:
-        cosine, sine = np.abs(np.cos(angle_rad))[:, None], np.abs(np.sin(angle_rad))[:, None]
-        size = size * cosine + size[:, ::-1] * sine
-    return np.concatenate([centre - size / 2, centre + size / 2], axis=1)
+def decode(
+    output: NDArray[np.float32], layout: Layout, confidence: float, size: tuple[int, int]
+) -> Candidates:
+    """The rows of `output` above `confidence`, in px of the network's input of `size` (width, height).
 
-
-def _finite(candidates: Candidates, total: int) -> Candidates:
-    """Without rows that hold NaN or infinity; ModelError when they are most of the output."""
-    good = np.isfinite(candidates.scores) & np.isfinite(candidates.boxes).all(axis=1)
-    refused = int(len(good) - good.sum())
-    if refused > MOST_REFUSED_SHARE * max(total, 1):
-        raise ModelError(
-            f"{refused} of {total} rows of the output are NaN or infinite; export the model again, in float32"
-        )
-    return candidates.take(good)
-
-
-def decode_raw(output: NDArray[np.float32], confidence: float, task: str = "detect") -> Candidates:
-    """Rows above `confidence` of a raw output (1, 4 + nc [+ 1], A): one class each, the likeliest."""
-    rows = output[0]
-    angle = rows[-1] if task == "obb" else None
-    scores = rows[4:-1] if task == "obb" else rows[4:]
-    best = scores.max(axis=0)
-    keep = ~(best < confidence)  # NaN stays in, to be counted
-    kept = rows[:4, keep].T
-    boxes = _upright(kept, None if angle is None else angle[keep])
-    return _finite(Candidates(boxes, best[keep], scores[:, keep].argmax(axis=0)), rows.shape[1])
-
-
-def decode_finished(output: NDArray[np.float32], confidence: float, task: str = "detect") -> Candidates:
-    """Rows above `confidence` of a finished output (1, N, 6): x0, y0, x1, y1, score, class.
-
-    An oriented box has centre x, y, width, height, score, class, angle.
+    Raises ModelError where most rows are no numbers, or the boxes are no pixels.
     """
+    if layout.kind == "raw":
+        return _raw(output, layout.oriented, confidence)
+    if layout.kind == "queries":
+        return _queries(output, confidence, size)
+    return _finished(output, layout.oriented, confidence)
+
+
+def _raw(output: NDArray[np.float32], oriented: bool, confidence: float) -> Candidates:
+    """Centre x, y, width, height, a score a class [, angle]: one class for each cell, the likeliest."""
+    rows = output[0]
+    scores = rows[4:-1] if oriented else rows[4:]
+    best = scores[0] if len(scores) == 1 else scores.max(axis=0)
+    # Threshold, then gather: few of some thousand cells have anything to say. NaN stays in, to be counted.
+    kept = np.flatnonzero(~(best < confidence))
+    classes = np.zeros(len(kept), np.int64) if len(scores) == 1 else scores[:, kept].argmax(axis=0)
+    angle_rad = rows[-1, kept] if oriented else None
+    return _sound(_upright(rows[:4, kept].T, angle_rad, best[kept], classes), rows.shape[1])
+
+
+def _finished(output: NDArray[np.float32], oriented: bool, confidence: float) -> Candidates:
+    """x0, y0, x1, y1, score, class; an oriented box: centre x, y, width, height, score, class, angle."""
     rows = output[0]
     rows = rows[~(rows[:, 4] < confidence)]
-    boxes = _upright(rows[:, :4], rows[:, 6]) if task == "obb" else rows[:, :4]
     classes = np.nan_to_num(rows[:, 5]).astype(np.int64)
-    return _finite(Candidates(boxes, rows[:, 4], classes), output.shape[1])
+    if oriented:
+        found = _upright(rows[:, :4], rows[:, 6], rows[:, 4], classes)
+    else:
+        found = Candidates(rows[:, :4], rows[:, 4], classes)
+    found = _sound(found, output.shape[1])
+    if len(found.scores) and np.abs(found.boxes).max() < NORMALISED_BELOW:
+        raise ModelError(
+            f"the boxes lie between {found.boxes.min():.2f} and {found.boxes.max():.2f}: shares of the "
+            "picture, where pixels are needed; export the model again with a newer Ultralytics, which says "
+            "in the metadata that its head is RT-DETR"
+        )
+    return found
 
 
-def suppress(candidates: Candidates, confidence: float, iou: float) -> Candidates:
-    """Without the lesser of two boxes of one class that overlap by more than `iou`, best first."""
-    if len(candidates.scores) == 0:
-        return candidates
-    sizes = np.concatenate(
-        [candidates.boxes[:, :2], candidates.boxes[:, 2:] - candidates.boxes[:, :2]], axis=1
-    )
+def _queries(output: NDArray[np.float32], confidence: float, size: tuple[int, int]) -> Candidates:
+    """RT-DETR: centre x, y, width, height as shares of the input; score and class, or a score a class."""
+    rows = output[0]
+    if rows.shape[1] == 6:
+        best, classes = rows[:, 4], np.nan_to_num(rows[:, 5]).astype(np.int64)
+    else:
+        best, classes = rows[:, 4:].max(axis=1), rows[:, 4:].argmax(axis=1)
+    kept = np.flatnonzero(~(best < confidence))
+    boxes = rows[kept, :4] * np.array([*size, *size], np.float32)
+    return _sound(_upright(boxes, None, best[kept], classes[kept]), len(rows))
+
+
+def _upright(
+    boxes: NDArray[np.float32],
+    angle_rad: NDArray[np.float32] | None,
+    scores: NDArray[np.float32],
+    classes: NDArray[np.int64],
+) -> Candidates:
+    """(N, 4) centre x, y, width, height -> xyxy; an oriented box becomes the upright one round it."""
+    centre, size = boxes[:, :2], boxes[:, 2:]
+    turned = None
+    if angle_rad is not None:
+        turned = np.column_stack([boxes, angle_rad])
+        with np.errstate(invalid="ignore"):  # an infinite angle gives NaN, which `_sound` leaves out
+            cosine, sine = np.abs(np.cos(angle_rad))[:, None], np.abs(np.sin(angle_rad))[:, None]
+            size = size * cosine + size[:, ::-1] * sine
+    half = size * np.float32(0.5)
+    return Candidates(np.concatenate([centre - half, centre + half], axis=1), scores, classes, turned)
+
+
+def _sound(found: Candidates, total: int) -> Candidates:
+    """Without rows that are no numbers or no scores; ModelError when they are most of `total`."""
+    # A sum is no number where any of its parts is none.
+    good = np.isfinite(found.boxes.sum(axis=1)) & (found.scores <= MOST_SCORE)
+    n_refused = len(good) - int(np.count_nonzero(good))
+    if n_refused == 0:
+        return found
+    if n_refused > MOST_REFUSED_SHARE * total:
+        raise ModelError(
+            f"{n_refused} of {total} rows of the output are NaN, infinite, or scores above 1; export the "
+            "model again, in float32 and with its scores from 0 to 1"
+        )
+    return found.take(good)
+
+
+def suppress(found: Candidates, iou: float) -> Candidates:
+    """Without the lesser of two boxes of one class that overlap by more than `iou`, best first.
+
+    Oriented boxes are compared as they lie: two whales side by side, seen aslant, have upright boxes that
+    overlap.
+    """
+    if len(found.scores) > MOST_CANDIDATES:
+        found = found.take(np.argpartition(-found.scores, MOST_CANDIDATES)[:MOST_CANDIDATES])
+    if len(found.scores) > 1:
+        found = found.take(_kept_turned(found, iou) if found.turned is not None else _kept(found, iou))
+    return best_first(found)
+
+
+def best_first(found: Candidates) -> Candidates:
+    """By score, and no more than any pod has."""
+    return found.take(np.argsort(-found.scores, kind="stable")[:MOST_BOXES])
+
+
+def _kept(found: Candidates, iou: float) -> NDArray[np.int64]:
+    """Which upright boxes stay."""
+    sizes = found.boxes.copy()
+    sizes[:, 2:] -= sizes[:, :2]
     # Lists, not arrays: the binding converts an array element by element, four times slower.
-    kept = cv2.dnn.NMSBoxesBatched(
-        sizes.tolist(), candidates.scores.tolist(), candidates.classes.tolist(), confidence, iou
-    )
-    order = np.asarray(kept, np.int64).reshape(-1)
-    order = order[np.argsort(-candidates.scores[order], kind="stable")][:MOST_BOXES]
-    return candidates.take(order)
+    kept = cv2.dnn.NMSBoxesBatched(sizes.tolist(), found.scores.tolist(), found.classes.tolist(), 0.0, iou)
+    return np.asarray(kept, np.int64).reshape(-1)
+
+
+def _kept_turned(found: Candidates, iou: float) -> NDArray[np.int64]:
+    """Which oriented boxes stay, class by class."""
+    assert found.turned is not None
+    kept = []
+    for number in np.unique(found.classes).tolist():
+        rows = np.flatnonzero(found.classes == number)
+        boxes = [
+            ((x, y), (max(width, 0.0), max(height, 0.0)), float(np.degrees(angle_rad)))
+            for x, y, width, height, angle_rad in found.turned[rows].tolist()
+        ]
+        chosen = cv2.dnn.NMSBoxesRotated(boxes, found.scores[rows].tolist(), 0.0, iou)
+        kept.append(rows[np.asarray(chosen, np.int64).reshape(-1)])
+    return np.concatenate(kept)

@@ -1,19 +1,26 @@
 """The detector: finds the animals in the newest frame.
 
-Hears FRAME. Says DETECTIONS at most at camera.detect_hz, with the frame's instant of capture; a frame without
-animals gives a message without boxes. A frame that is gone from the ring is skipped and counted. When FRAME
-dies it falls silent: presence fades and nobody acts on old boxes. A model that is missing or broken ends the
-process with exit code 3 and the remedy.
+Hears FRAME, and VEHICLE_STATE to know how large an animal should look. Says DETECTIONS at most at
+camera.detect_hz, with the frame's instant of capture; a frame without animals gives a message without boxes.
+A frame that is gone from the ring is skipped and counted. When FRAME dies, or its pictures stay the same to
+the last bit for a second, it falls silent: presence fades and nobody acts on old boxes. A model that is
+missing or broken ends the process with exit code 3 and the remedy. On SIGHUP it reads its settings and the
+model again; a new model that cannot be used leaves the old one at work, and the heartbeat says so.
 """
 
 from typing import Any
 
 import numpy as np
 
+from drivers.cameras.pinhole import Pinhole
 from lcmtypes import channels, make
-from lcmtypes.podwatch import box_t, detections_t, frame_t
+from lcmtypes.podwatch import box_t, detections_t, frame_t, vehicle_state_t
 from procs.detector.yolo import ModelError
 from procs.runtime import Runtime, RuntimeFailure
+
+FROZEN_AFTER_S = 1.0
+HEIGHT_LIFE_S = 2.0  # an older height says nothing of the next frame
+LEAST_HEIGHT_M = 2.0  # below it the drone stands or lands
 
 
 class DetectorShell:
@@ -23,29 +30,34 @@ class DetectorShell:
         self._runtime = runtime
         self._frames = runtime.open("frames")
         try:
-            self._detector = runtime.open("detector")
+            self._take(runtime.open("detector"))
         except ModelError as error:
             raise RuntimeFailure(str(error)) from error
-        camera = runtime.settings.mission.camera
-        # Half a frame early is in time, so that 5 Hz of a 20 Hz camera is each fourth frame.
-        self._least_gap_us = 1e6 / camera.detect_hz - 0.5e6 / camera.rate_hz
         self._last_utime = 0
+        self._changed_utime = 0  # capture of the newest frame that was unlike the one before it
+        self._height_m = 0.0
+        self._height_utime = 0
 
     def on_frame(self, frame: frame_t) -> None:
         """Search one frame, if it is time for one."""
-        since_us = frame.utime - self._last_utime
-        if 0 <= since_us < self._least_gap_us:
+        camera = self._runtime.settings.mission.camera
+        # Half a frame early is in time, so that 5 Hz of a 20 Hz camera is each fourth frame.
+        least_gap_us = 1e6 / camera.detect_hz - 0.5e6 / camera.rate_hz
+        if 0 <= frame.utime - self._last_utime < least_gap_us:
             return
         image = self._frames.read(frame)
         if image is None:
             return
         self._last_utime = frame.utime
+        self._detector.animal_px = self._animal_px(frame)
         try:
             found = self._detector.detect(image)
         except (ValueError, ModelError) as error:
             self._runtime.degraded(str(error), cause="detect")
             return
         self._runtime.ok("detect")
+        if not self._is_alive(frame, found):
+            return
         boxes = self._sound(found)
         self._runtime.publish(
             channels.DETECTIONS,
@@ -60,6 +72,61 @@ class DetectorShell:
                 boxes=boxes,
             ),
         )
+
+    def on_vehicle_state(self, state: vehicle_state_t) -> None:
+        """How high the camera is."""
+        if state.position_ok:
+            self._height_m, self._height_utime = -state.d_m, state.utime
+
+    def reload(self) -> None:
+        """Take the model and the thresholds that the settings name now, or keep what there is."""
+        try:
+            detector = self._runtime.open("detector")
+        except (ModelError, RuntimeFailure) as error:
+            self._runtime.degraded(f"the new model is not used, the old one stays: {error}", cause="reload")
+            return
+        self._runtime.ok("reload")
+        self._take(detector)
+
+    def _take(self, detector: Any) -> None:
+        """Use a detector from now on."""
+        self._detector = detector
+        warning = getattr(detector, "warning", "")
+        if warning:
+            self._runtime.degraded(warning, cause="provider")
+        else:
+            self._runtime.ok("provider")
+
+    def _animal_px(self, frame: frame_t) -> float | None:
+        """How long the mission's animal is in a frame's middle, px; None where the height is not known."""
+        mission = self._runtime.settings.mission
+        age_s = abs(frame.utime - self._height_utime) / 1e6
+        if age_s > HEIGHT_LIFE_S or not self._height_m >= LEAST_HEIGHT_M:
+            return None
+        camera = Pinhole((frame.width, frame.height), float(np.radians(mission.camera.vfov_deg)))
+        return mission.watch.animal_length_m / camera.metres_per_px(self._height_m)
+
+    def _is_alive(self, frame: frame_t, found: Any) -> bool:
+        """Whether the camera shows what is there now; what is wrong with its pictures goes to the
+        heartbeat.
+        """
+        trouble = getattr(found, "trouble", "")
+        if trouble:
+            self._runtime.degraded(trouble, cause="picture")
+        else:
+            self._runtime.ok("picture")
+        if not getattr(found, "n_repeats", 0) or frame.utime < self._changed_utime:
+            self._changed_utime = frame.utime
+        frozen_s = (frame.utime - self._changed_utime) / 1e6
+        if frozen_s < FROZEN_AFTER_S:
+            self._runtime.ok("frozen")
+            return True
+        self._runtime.degraded(
+            f"the camera gives the same picture for {frozen_s:.1f} s; nothing is detected in it; does the "
+            "camera hang?",
+            cause="frozen",
+        )
+        return False
 
     def _sound(self, found: Any) -> list[box_t]:
         """The boxes that are numbers; others are left out and told."""
@@ -89,3 +156,5 @@ class DetectorShell:
 def setup(runtime: Runtime) -> None:
     shell = DetectorShell(runtime)
     runtime.on(channels.FRAME, shell.on_frame, newest=True)
+    runtime.on(channels.VEHICLE_STATE, shell.on_vehicle_state, newest=True)
+    runtime.on_reload(shell.reload)

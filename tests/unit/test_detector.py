@@ -6,7 +6,6 @@ import hashlib
 import os
 import subprocess
 import sys
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -17,43 +16,9 @@ from hypothesis import strategies as st
 from onnx import TensorProto, helper, numpy_helper
 
 import models
-from procs.detector.decode import Candidates, layout_of, suppress
-from procs.detector.tiles import drop_cut, tile_windows
+from procs.detector.decode import Candidates, Layout, layout_of, suppress
 from procs.detector.yolo import Detector, ModelError
-
-NAMES = {"task": "detect", "names": "{0: 'whale'}", "imgsz": "[64, 64]"}
-PICTURE = np.random.default_rng(0).integers(0, 255, (64, 64, 3), dtype=np.uint8)
-
-
-def network(
-    path: Path,
-    output: np.ndarray,
-    metadata: dict[str, str] | None = None,
-    shape: tuple[int | str, ...] = (1, 3, 64, 64),
-    kind: int = TensorProto.FLOAT,
-) -> Path:
-    """An ONNX file that answers `output` whatever it is shown."""
-    constant = helper.make_node("Constant", [], ["output0"], value=numpy_helper.from_array(output, "value"))
-    graph = helper.make_graph(
-        [constant],
-        "test",
-        [helper.make_tensor_value_info("images", kind, shape)],
-        [helper.make_tensor_value_info("output0", TensorProto.FLOAT, output.shape)],
-    )
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
-    for key, value in (NAMES if metadata is None else metadata).items():
-        entry = model.metadata_props.add()
-        entry.key, entry.value = key, value
-    onnx.save(model, str(path))
-    return path
-
-
-def raw(*rows: tuple[float, ...], cells: int = 100) -> np.ndarray:
-    """(1, len(row), cells): the rows given, then cells that found nothing."""
-    output = np.zeros((1, len(rows[0]), cells), np.float32)
-    for index, row in enumerate(rows):
-        output[0, :, index] = row
-    return output
+from tests.unit.detector_networks import NAMES, PICTURE, network, raw
 
 
 def test_a_raw_output_is_decoded_and_overlaps_go(tmp_path: Path) -> None:
@@ -222,11 +187,11 @@ def test_settings_out_of_range_are_refused(bad: dict[str, object]) -> None:
 
 
 def test_layouts_are_told_apart_by_shape_and_names() -> None:
-    assert layout_of((1, 5, 2100), 1) == "raw"
-    assert layout_of((1, 84, 8400), 80) == "raw"
-    assert layout_of((1, 300, 6), 1) == "finished"
-    assert layout_of((1, 300, 7), 15, "obb") == "finished"
-    assert layout_of((1, 20, 8400), 15, "obb") == "raw"
+    assert layout_of((1, 5, 2100), 1) == Layout("raw")
+    assert layout_of((1, 84, 8400), 80, "detect") == Layout("raw")
+    assert layout_of((1, 300, 6), 1) == Layout("finished")
+    assert layout_of((1, 300, 7), 15, "obb") == Layout("finished", oriented=True)
+    assert layout_of((1, 20, 8400), 15, "obb") == Layout("raw", oriented=True)
     with pytest.raises(ValueError, match="neither"):
         layout_of((1, 8400, 84), 80)
 
@@ -245,7 +210,7 @@ def test_suppression_leaves_no_pair_that_overlaps_and_drops_nothing_else(
     table = np.array(rows, np.float32).reshape(-1, 5)
     corners = np.concatenate([table[:, :2], table[:, :2] + table[:, 2:4]], axis=1)
     found = Candidates(corners, table[:, 4], np.zeros(len(table), np.int64))
-    kept = suppress(found, 0.25, 0.45)
+    kept = suppress(found, 0.45)
 
     def iou(one: np.ndarray, other: np.ndarray) -> float:
         shared = np.clip(np.minimum(one[2:], other[2:]) - np.maximum(one[:2], other[:2]), 0, None).prod()
@@ -259,42 +224,6 @@ def test_suppression_leaves_no_pair_that_overlaps_and_drops_nothing_else(
             iou(one, other) > 0.449 and better >= score
             for other, better in zip(kept.boxes, kept.scores, strict=True)
         )
-
-
-@settings(deadline=None, max_examples=60)
-@given(st.integers(40, 4000), st.integers(40, 4000), st.sampled_from([64, 100, 320, "auto"]))
-def test_tiles_cover_the_picture_and_share_a_quarter(width: int, height: int, tile: int) -> None:
-    windows = tile_windows((width, height), tile, (320, 320))
-    if not windows:
-        return
-    for near, far, length in ((0, 2, width), (1, 3, height)):
-        spans = sorted({(window[near], window[far]) for window in windows})
-        assert spans[0][0] == 0
-        assert spans[-1][1] == length
-        side = max(last - first for first, last in spans)
-        assert all(first[1] - second[0] >= 0.25 * side - 2 for first, second in pairwise(spans))
-    if tile == "auto":
-        assert len(windows) <= 12
-
-
-def test_a_box_cut_by_a_seam_is_left_to_the_neighbour_but_not_at_the_pictures_border() -> None:
-    found = Candidates(
-        np.array([[0, 10, 20, 30], [80, 10, 100, 30], [40, 40, 60, 60]], np.float32),
-        np.ones(3, np.float32),
-        np.zeros(3, np.int64),
-    )
-    assert drop_cut(found, (0, 0, 100, 100), (175, 100)).boxes[:, 0].tolist() == [0, 40]
-    assert drop_cut(found, (75, 0, 175, 100), (175, 100)).boxes[:, 0].tolist() == [80, 40]
-
-
-def test_tiling_finds_in_tiles_and_reports_in_the_whole_picture(tmp_path: Path) -> None:
-    # The network always sees a box in the middle of what it is shown: once for the whole and once a tile.
-    model = network(tmp_path / "raw.onnx", raw((32, 32, 10, 10, 0.9)))
-    picture = np.random.default_rng(2).integers(0, 255, (64, 112, 3), dtype=np.uint8)
-    assert len(Detector(model).detect(picture)) == 1
-    found = Detector(model, tile=64).detect(picture)
-    middles = sorted(((found.boxes[:, 0] + found.boxes[:, 2]) / 2).round(3).tolist())
-    assert middles == [32.0, 56.0, 80.0]
 
 
 def test_the_shipped_model_is_small_and_says_what_it_is() -> None:

@@ -11,6 +11,7 @@ from procs.settings import (
     MachineSettings,
     Mission,
     MissionError,
+    beside,
     load_mission,
 )
 
@@ -20,13 +21,15 @@ LOOPBACK = "127."
 
 
 def read_fleet(path: Path) -> Mission:
-    """The fleet file, its key's place made absolute: beside the file unless it says otherwise.
+    """The fleet file, the places of its key and its model made absolute: beside the file unless it says
+    otherwise.
 
     Raises MissionError.
     """
     mission = load_mission(path, Mission)
     key = key_path(str(path.resolve().parent), mission.radio.key_file)
-    return mission.model_copy(update={"radio": mission.radio.model_copy(update={"key_file": str(key)})})
+    radio = mission.radio.model_copy(update={"key_file": str(key)})
+    return beside(path, mission).model_copy(update={"radio": radio})
 
 
 def machine_of(mission: Mission, drone_id: int) -> MachineSettings:
@@ -62,7 +65,7 @@ def drone_settings(
             "drivers.autopilots.mavlink_link:open_link", address=machine.autopilot, system_id=drone_id
         ),
         "radio": _radio(mission, drone_id, machine.radio),
-        "detector": _spec("procs.detector.yolo:Detector"),
+        "detector": _spec("procs.detector.yolo:Detector", **mission.detector.options()),
         "tracker": _spec("procs.tracker.mask_tracker:MaskTracker"),
     }
     return DroneSettings(

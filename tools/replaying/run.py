@@ -22,7 +22,7 @@ from procs.queue_executor import ClockError, EventQueue, QueueRuntime, VirtualBu
 from procs.runtime import HEARTBEAT_PERIOD_S
 from procs.settings import DroneSettings, Mission
 
-__all__ = ["SAYS", "LoggedFrames", "Replayed", "Said", "replay"]
+__all__ = ["SAYS", "LoggedFrames", "Replayed", "Said", "replay", "settings_of"]
 
 # What each process that can be replayed says, besides HEARTBEAT.
 SAYS = {
@@ -131,7 +131,7 @@ class _Replay:
         clock: ClockError,
     ) -> None:
         self._process, self._log, self._clock = process, log, clock
-        self._settings = _settings(log)
+        self._settings = settings_of(log)
         self._drivers = {name: _opener(make) for name, make in drivers.items()} | self._edges()
         self._starts = _starts(beats)
         self._is_virtual = all(beat.pid == 0 for beat in beats)
@@ -223,7 +223,7 @@ def _opener(make: Callable[[], Any]) -> Callable[[str], Any]:
     return lambda _process: make()
 
 
-def _settings(log: DroneLog) -> DroneSettings:
+def settings_of(log: DroneLog) -> DroneSettings:
     """What the drone was told, from the log. Raises LogError where it does not say."""
     try:
         mission = Mission.model_validate_json(log.metadata["mission"])

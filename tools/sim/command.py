@@ -11,7 +11,7 @@ from rich.markup import escape
 import fleets
 from drivers.sim.render import open_surface
 from procs.runtime import RuntimeFailure
-from procs.settings import DroneEntry, MissionError, load_mission, validate
+from procs.settings import DroneEntry, MissionError, beside, load_mission, validate
 from tools.buses import has_multicast_route
 from tools.errors import INTERRUPTED, plain_errors
 from tools.folders import new_folder
@@ -121,7 +121,7 @@ def read_mission(name: str) -> SimMission:
             near = difflib.get_close_matches(name, there, n=1)
             guess = f"did you mean {near[0]!r}? " if near else ""
             raise MissionError(f"{guess}{error}; or give the path of a mission file") from error
-    return load_mission(path, SimMission)
+    return beside(path, load_mission(path, SimMission))
 
 
 def with_overrides(

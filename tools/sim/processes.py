@@ -248,7 +248,8 @@ class ProcessFleet:
     def _models(self, drone_id: int) -> Specs:
         """What looks at the pixels; their stand-ins with `--sensor boxes`."""
         if self.plan.sensor != "boxes":
-            return {"detector": ("procs.detector.yolo:Detector", {}), "tracker": (MASK_TRACKER, {})}
+            options = self.plan.mission.detector.options()
+            return {"detector": ("procs.detector.yolo:Detector", options), "tracker": (MASK_TRACKER, {})}
         seed = {"seed": self.plan.mission.seed * 100 + drone_id}
         return {
             "detector": ("drivers.sim.boxes:BoxDetector", seed),
