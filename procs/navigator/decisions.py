@@ -51,9 +51,12 @@ def overriding_events(now: Situation, memory: Memory) -> list[Event]:
         return [*events, Event.DOUBT]
     if now.battery is not None and now.battery < limits.battery_return:
         return [*events, Event.BATTERY_LOW]
+    boat_is_lost = _boat_is_lost(now, memory)
+    if boat_is_lost:
+        events.append(Event.BOAT_LOST)
     if now.command == operator.RETURN:
         events.append(Event.ORDER_RETURN)
-    if now.command == operator.HOLD:
+    if now.command == operator.HOLD and not boat_is_lost:
         events.append(Event.ORDER_HOLD)
     if _is_blind(now, memory):
         events.append(Event.BLIND)
@@ -62,6 +65,14 @@ def overriding_events(now: Situation, memory: Memory) -> list[Event]:
     if _fleet_returns(now, memory):
         events.append(Event.FLEET_RETURNS)
     return events
+
+
+def _boat_is_lost(now: Situation, memory: Memory) -> bool:
+    """The mission asks to come home without the boat, and there was word of it but is none any more."""
+    fleet, limit_s = now.inputs.fleet, now.mission.boat.lost_return_s
+    if fleet is not None and fleet.boat_age_ms >= 0:  # a relay that starts anew has never heard it
+        memory.boat_us = max(memory.boat_us, fleet.utime - fleet.boat_age_ms * 1000)
+    return limit_s > 0 and memory.boat_us > 0 and now.seconds_since(memory.boat_us) > limit_s
 
 
 def _is_blind(now: Situation, memory: Memory) -> bool:

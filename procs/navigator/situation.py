@@ -119,6 +119,7 @@ class Memory:
     free_animals: tuple[int, ...] = ()  # those
     free_key: EpisodeKey = (0, 0)  # newest episode that had ended when they were looked at last
     n_asked: int = 0  # episodes that have ended and left them to nobody
+    boat_us: int = 0  # when there was word of the boat last, 0 while there was none
     held_us: int = 0  # last instant of doubt
     pilot_us: int = 0  # last instant at which the pilot had it
     watch_seen: bool = False  # it has seen the fleet watch, at any time

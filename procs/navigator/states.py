@@ -69,6 +69,7 @@ class Event(Enum):
     ORDER_HOLD = "ordered to hold"
     ORDER_RETURN = "ordered to return"
     ORDER_LAND = "ordered to land"
+    BOAT_LOST = "the boat is silent"
     HELD_TOO_LONG = "held too long"
     TO_STANDBY = "doubt over: stands by"
     TO_SCOUT = "doubt over: scouts on"
@@ -136,6 +137,7 @@ RULES = (
     Rule(FLYING, E.ORDER_LAND, S.LAND),
     Rule(FLYING, E.BATTERY_EMPTY, S.LAND),
     Rule(AT_WORK, E.ORDER_RETURN, S.RETURN),
+    Rule(AT_WORK, E.BOAT_LOST, S.RETURN),
     Rule(AT_WORK, E.BATTERY_LOW, S.RETURN),
     Rule((S.HOLD,), E.TO_STANDBY, S.STANDBY),
     Rule((S.HOLD,), E.TO_SCOUT, S.SCOUT),
@@ -145,6 +147,7 @@ RULES = (
     Rule((S.HOLD,), E.TO_LAND, S.LAND),
     Rule((S.HOLD,), E.HELD_TOO_LONG, S.RETURN),
     Rule((S.HOLD,), E.ORDER_RETURN, S.RETURN),
+    Rule((S.HOLD,), E.BOAT_LOST, S.RETURN),
     Rule((S.HOLD,), E.ORDER_LAND, S.LAND),
     Rule((S.HOLD,), E.BATTERY_LOW, S.RETURN),
     Rule((S.HOLD,), E.BATTERY_EMPTY, S.LAND),

@@ -91,6 +91,10 @@ class Members:
             return True
         return member in self._refreshed_us and now_us - self._refreshed_us[member] <= self._lost_after_us
 
+    def age_us(self, member: int, now_us: int) -> int | None:
+        """How long ago word of a member was refreshed; None where it never was."""
+        return now_us - self._refreshed_us[member] if member in self._refreshed_us else None
+
     def living(self, now_us: int) -> tuple[int, ...]:
         """The living drones in ring order, this one among them; never the boat."""
         return tuple(member for member in self.roster if self.lives(member, now_us))

@@ -213,6 +213,7 @@ class Relay:
         heard = [*living, *(member for member in (BOAT_ID,) if self.members.lives(member, now_us))]
         rows = self.fleet.rows(heard, now_us)
         left = self.fleet.left(fleet_us)
+        boat_us = self.members.age_us(BOAT_ID, now_us)
         return make(
             fleet_state_t,
             fleet_offset_us=offset_us,
@@ -224,6 +225,7 @@ class Relay:
             n_rows=len(rows),
             rows=rows,
             order=self.fleet.order_for(self.own_id, fleet_us).message(),
+            boat_age_ms=-1 if boat_us is None else min(boat_us // 1000, 2**31 - 1),
             n_left=len(left),
             left=left,
         )

@@ -95,6 +95,7 @@ class Fleet:
         self.agrees = True  # what the stand-in registrar answers
         self.command = 0
         self.left: tuple[int, ...] = ()
+        self.boat_age_ms = -1
         self.drones = [self._drone(entry) for entry in settings.drones]
         self.rows: list[podwatch.fleet_row_t] = []
         self.rows_utime = 0
@@ -209,6 +210,7 @@ class Fleet:
             fleet = make(podwatch.fleet_state_t, utime=self.rows_utime, n_rows=len(self.rows), rows=self.rows)
             fleet.order = make(podwatch.operator_t, utime=self.utime, command=self.command)
             fleet.n_left, fleet.left = len(self.left), self.left
+            fleet.boat_age_ms = self.boat_age_ms
         return Inputs(
             self.utime,
             self._vehicle(drone),

@@ -125,7 +125,7 @@ def test_members_that_share_an_address_or_have_none_are_named(fleet):
     text = fleet.read_text()
     fleet.write_text(text.replace("10.76.0.2:14600", "10.76.0.1:14600"))
     assert "radio 10.76.0.1:14600 is drone 1's too" in lacking(fleet)
-    fleet.write_text(text.replace('[boat]\nradio = "10.76.0.100:14600"', ""))
+    fleet.write_text(text.partition("[boat]")[0] + "".join(text.partition("\n[[drones]]")[1:]))
     assert "no boat is named that could say so" in lacking(fleet)
     fleet.write_text(text + "[[drones]]\nid = 9\nhome_n_m = 50.0\n")
     assert "drone 9 address" in lacking(fleet)

@@ -234,6 +234,41 @@ def test_an_order_to_leave_an_animal_lets_go_of_it() -> None:
     assert fleet.drone(1).navigator.memory.animal != left, "its old certificate gives it back to nobody"
 
 
+@pytest.mark.parametrize(
+    ("lost_return_s", "age_ms", "state"),
+    [
+        (30.0, 31_000, State.RETURN),
+        (30.0, 29_000, State.SCOUT),
+        (30.0, -1, State.SCOUT),  # there never was one
+        (0.0, 600_000, State.SCOUT),  # nobody asked for it
+    ],
+)
+def test_a_lost_boat_brings_the_fleet_home_where_the_mission_says_so(
+    lost_return_s: float, age_ms: int, state: State
+) -> None:
+    fleet = Fleet(mission(1, boat={"lost_return_s": lost_return_s}), POD)
+    fleet.visible = False
+    fleet.run(40.0)
+    fleet.boat_age_ms = age_ms
+    fleet.run(0.5)
+    assert fleet.drone(1).navigator.state == state
+    if state == State.RETURN:
+        assert fleet.drone(1).navigator.memory.reason == "the boat is silent"
+
+
+def test_a_lost_boat_ends_its_order_to_hold_and_a_relay_that_forgot_it_does_not_make_it_found() -> None:
+    fleet = Fleet(mission(1, boat={"lost_return_s": 30.0}), POD)
+    fleet.run(60.0, lambda: fleet.drone(1).ned[0] > 20)
+    fleet.command, fleet.boat_age_ms = podwatch.operator_t.HOLD, 0
+    fleet.run(1.0)
+    assert fleet.drone(1).navigator.state == State.HOLD
+    fleet.boat_age_ms = -1
+    fleet.run(28.0)
+    assert fleet.drone(1).navigator.state == State.HOLD
+    fleet.run(4.0)
+    assert fleet.drone(1).navigator.state in (State.RETURN, State.LAND)
+
+
 def test_the_pilot_always_wins_and_hands_back() -> None:
     fleet = Fleet(mission(1), POD)
     fleet.run(60.0, lambda: fleet.all_in(State.SCOUT))

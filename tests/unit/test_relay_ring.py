@@ -244,6 +244,7 @@ def test_the_boats_order_reaches_everybody_and_expires() -> None:
     fleet.run(3)
     assert [drone.state.order.command for drone in fleet.living] == [operator_t.START] * 4
     assert all(0 not in (drone.state.left_id, drone.state.right_id) for drone in fleet.living)
+    assert all(drone.state.boat_age_ms < 1_500 for drone in fleet.living)
     fleet[0].core.fleet.order(Order(fleet[0].fleet_us, operator_t.HOLD, 3, -1, 10))
     fleet.run(3)
     assert [drone.state.order.command for drone in fleet.living] == [
@@ -255,6 +256,7 @@ def test_the_boats_order_reaches_everybody_and_expires() -> None:
     fleet[0].die()
     fleet.run(9)
     assert [drone.state.order.command for drone in fleet.living] == [operator_t.START] * 4
+    assert all(8_000 < drone.state.boat_age_ms < 11_000 for drone in fleet.living)
     fleet.run(9)
     assert [drone.state.order.command for drone in fleet.living] == [operator_t.NONE] * 4
     assert fleet.members() == [0b1111] * 4

@@ -54,6 +54,7 @@ quota_gb = 16.0              # above it the oldest pictures go first
 
 [boat]
 radio = "10.76.0.100:{port}"  # where the drones reach the boat
+lost_return_s = 0.0          # silent for so long, the boat is lost and the fleet comes home; 0: it flies on
 """
 
 DRONE = """
