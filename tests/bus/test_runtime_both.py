@@ -123,6 +123,27 @@ def test_newest_only_handles_the_last_of_what_waits_and_counts_the_rest(bench):
     assert (last.n_dropped, last.n_gaps, last.n_bad) == (39, 0, 0)
 
 
+def test_what_came_during_a_slow_handler_is_taken_at_once_and_the_newest_comes_next(tmp_path):
+    bench = BusBench(tmp_path)
+    handled: list[int] = []
+
+    def slow(message: track_t) -> None:
+        for seq in range(1, 201) if not handled else ():
+            bench._others.publish(channels.TRACK, track(seq))
+        handled.append(message.seq)
+        deadline = time.monotonic() + DEADLINE_S
+        while sum(channel == channels.TRACK for channel, _ in bench._said) < 201:
+            assert time.monotonic() < deadline, "the bus lost a message"
+            bench._others.handle_timeout(100)
+
+    bench.runtime.on(channels.TRACK, slow, newest=True)
+    bench.say(channels.TRACK, track(0))
+    last = beats(bench.run(3.0))[-1]
+    assert (handled[0], handled[-1]) == (0, 200)
+    assert len(handled) < 10, "LCM's own thread may hand over the last few a moment later"
+    assert last.n_dropped == 201 - len(handled)
+
+
 def test_a_full_queue_drops_the_oldest_and_counts_it(bench):
     handled: list[int] = []
     bench.runtime.on(channels.TRACK, lambda message: handled.append(message.seq), capacity=5)

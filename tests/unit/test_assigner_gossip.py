@@ -92,6 +92,15 @@ def test_a_ring_agrees_on_the_cheapest_distinct_choice(n: int) -> None:
     assert max(sizes, default=0) <= MAX_PACKET_BYTES
 
 
+@pytest.mark.parametrize("n", [2, 3, 5])
+def test_where_any_choice_is_as_cheap_all_find_the_same_one(n: int) -> None:
+    agents = fleet_of(np.full((n, n + 1), 20.0), list(range(n + 1)))
+    talk(agents, ring_of(n), np.random.default_rng(n))
+    assert not any(agent.clash for agent in agents)
+    assert all(agent.certified for agent in agents)
+    assert len({tuple(agent.choices) for agent in agents}) == 1
+
+
 @pytest.mark.parametrize("n", [2, 6])
 def test_a_line_agrees_too(n: int) -> None:
     random = np.random.default_rng(0)

@@ -118,6 +118,40 @@ def test_one_wrong_edge_is_no_consensus():
     assert not any(node.result.consensus for node in nodes)
 
 
+def test_a_lap_that_never_comes_back_to_the_first_views_own_ids_is_no_consensus():
+    """Every edge sure of itself, every animal confirmed by every view, and the ring open all the same."""
+    boxes = np.array([[100.0, 200, 180, 230], [400, 200, 480, 230]])
+    half_turn = np.diag([-1.0, -1.0, 1.0])
+    turns = []
+
+    def restless(source, target, *, prior=None):
+        """Two animals alike look the same the other way round: the first view changes its mind each lap."""
+        if restless.first is not None and source is restless.first:
+            turns.append(1)
+        swaps = len(turns) % 2 == 1 and source is restless.first
+        rows = np.arange(2)
+        about = np.eye(3)
+        about[:2, 2] = target.centres.mean(axis=0)
+        back = np.eye(3)
+        back[:2, 2] = -source.centres.mean(axis=0)
+        transform = about @ (half_turn if swaps else np.eye(3)) @ back
+        columns = rows[::-1] if swaps else rows
+        nobody = np.zeros(0, dtype=int)
+        return BoxAlignment(transform, np.column_stack([rows, columns]), nobody, nobody, 0.0, 0.99, False, 1)
+
+    restless.first = None
+    nodes = [RingNode(boxes, one, [1, 2, 3], image_size=(640, 480), register=restless) for one in (1, 2, 3)]
+    fly(nodes, ring_links(3))
+    assert all(node.result.consensus for node in nodes), "this registration is believed while it is at rest"
+
+    nodes = [RingNode(boxes, one, [1, 2, 3], image_size=(640, 480), register=restless) for one in (1, 2, 3)]
+    restless.first = nodes[0]._observer.marks
+    fly(nodes, ring_links(3))
+    assert len(turns) >= 2
+    assert all(node.result.confidence > 0.9 for node in nodes)
+    assert not any(node.result.consensus for node in nodes)
+
+
 @pytest.mark.parametrize("wrong_row", [1, 2, 3])
 def test_an_edge_that_was_wrong_in_the_first_lap_is_repaired(wrong_row):
     views = views_of(5, 4, seed=2)

@@ -37,17 +37,18 @@ def foreign_modules(copy: Path) -> list[str]:
     """Files that were imported in place of those of the same packages in the copy."""
     own = [path.name for path in copy.iterdir() if path.is_dir()]
     files = [
-        Path(module.__file__)
+        getattr(module, "__file__", None)  # a folder without __init__.py has none
         for name, module in sorted(sys.modules.items())
-        if name.partition(".")[0] in own and getattr(module, "__file__", None)
+        if name.partition(".")[0] in own
     ]
-    return [str(file) for file in files if not file.resolve().is_relative_to(copy.resolve())]
+    return [file for file in files if file and not Path(file).resolve().is_relative_to(copy.resolve())]
 
 
 def _first_line(report: pytest.TestReport) -> str:
     crash = getattr(report.longrepr, "reprcrash", None)
-    lines = str(crash.message if crash is not None else report.longrepr).strip().splitlines()
-    return lines[0] if lines else ""
+    text = str(crash.message if crash is not None else report.longrepr)
+    first, *rest = [line.strip() for line in text.splitlines() if line.strip()] or [""]
+    return " ".join([first, *rest[:1]]) if first.endswith(":") else first  # numpy says what only in the next
 
 
 def pytest_configure(config: pytest.Config) -> None:

@@ -252,16 +252,19 @@ def command(only: str, workers: int, out: Path) -> bool:
 def print_outcomes(outcomes: Sequence[Outcome], console: Console) -> None:
     """The table, and how many were noticed."""
     table = Table(title="podwatch bench faults", title_justify="left")
-    for heading in ("fault", "file", "test", "result", "first line of the failure"):
+    for heading in ("fault, and its file", "test, and the first line of its failure", "result"):
         table.add_column(heading, overflow="fold")
     table.add_column("s", justify="right")
     for outcome in outcomes:
-        fault, is_red = outcome.fault, outcome.result == RED
+        fault, colour = outcome.fault, "red" if outcome.result == RED else "bold yellow"
         said = outcome.said if len(outcome.said) <= SHOWN else f"{outcome.said[: SHOWN - 3]}..."
-        cells = (fault.name, fault.file, "\n".join(map(_short, fault.tests)))
-        colour = "red" if is_red else "bold yellow"
-        result = f"[{colour}]{outcome.result}[/]"
-        table.add_row(*map(escape, cells), result, escape(said), f"{outcome.seconds:.1f}")
+        tests = "\n".join(map(_short, fault.tests))
+        table.add_row(
+            f"{escape(fault.name)}\n[dim]{escape(fault.file)}[/]",
+            f"{escape(tests)}\n[dim]{escape(said)}[/]",
+            f"[{colour}]{outcome.result}[/]",
+            f"{outcome.seconds:.1f}",
+        )
     console.print(table)
     n_red = sum(outcome.result == RED for outcome in outcomes)
     console.print(f"{n_red} of {len(outcomes)} faults turn their test red", highlight=False)
