@@ -14,6 +14,7 @@ from tools.errors import plain_errors, wanted_extra
 from tools.fly import fly
 from tools.play import play
 from tools.replay import replay_command
+from tools.report.command import report
 from tools.sim.command import sim
 from tools.spy.command import spy
 
@@ -32,6 +33,7 @@ app.command("fly")(fly)
 app.command("boat")(boat)
 app.command("play")(play)
 app.command("replay")(replay_command)
+app.command("report")(report)
 app.command("spy")(spy)
 app.command("doctor")(doctor)
 app.add_typer(log.app, name="log")
@@ -52,16 +54,6 @@ def views(
 
     with plain_errors():
         command(pictures, out)
-
-
-@app.command("report")
-def report(folder: Annotated[Path, typer.Argument(help="A run's folder.")]) -> None:
-    """Write report.html (and summary.json) of a run's folder anew."""
-    from tools.sim.run import finish
-
-    with plain_errors():
-        finish(folder)
-    typer.echo(str(folder / "report.html"))
 
 
 @app.command("render")

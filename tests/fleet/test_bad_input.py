@@ -339,7 +339,7 @@ ROWS: list[tuple[Callable[[Path], Outcome], tuple[str, ...], int]] = [
     (corrupt_log, ("warning: ", "drone_1.mcap"), 0),
     (truncated_log, ("drone_1.mcap: was not closed",), 0),
     (empty_log, ("drone_1.mcap: is empty (0 bytes)",), 2),
-    (folder_without_logs, ("truth.json: cannot be read", "give the folder that `podwatch sim` wrote"), 2),
+    (folder_without_logs, ("no drone_<id>.mcap in this folder", "give a run's folder, or drones' logs"), 2),
     (missing_model, ("detector: ", "a.onnx: no such model file", "give the path of an ONNX file"), 3),
     (broken_model, ("a.onnx: not a model that onnxruntime loads", "export it as ONNX again"), 3),
     (driver_of_no_such_name, ("camera: driver drivers.cameras.nobody:Camera", "check its name"), 3),

@@ -198,7 +198,7 @@ def test_a_key_that_the_mission_names_is_used_and_never_replaced(tmp_path):
 def test_a_report_of_no_run_and_views_of_no_picture(tmp_path):
     result = podwatch("report", tmp_path)
     assert (result.exit_code, result.stdout) == (2, "")
-    assert "truth.json: cannot be read" in result.stderr
+    assert "no drone_<id>.mcap in this folder" in result.stderr
     (tmp_path / "a.jpg").write_text("no picture")
     result = podwatch("views", tmp_path / "a.jpg", tmp_path / "a.jpg")
     assert result.exit_code == 2

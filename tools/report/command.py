@@ -1,0 +1,49 @@
+"""`podwatch report`: one page for a mission or a day of several, from runs or from drones' logs."""
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from tools.errors import plain_errors
+
+__all__ = ["report"]
+
+
+def report(
+    paths: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="RUN-or-LOGS...",
+            help="Runs' folders, a folder of them for a day, or drones' logs of one mission.",
+            show_default=False,
+        ),
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            help="The page to write. [default: report.html in the mission's folder, or here for a day]",
+            show_default=False,
+        ),
+    ] = None,
+) -> None:
+    """Make report.html: what went wrong, where all flew, who watched whom, pictures and figures."""
+    from tools.report.flights import find_flights, read_flight
+    from tools.report.page import write_report
+
+    with plain_errors():
+        found = find_flights(paths)
+        flights = [read_flight(logs) for logs in found]
+        page = write_report(flights, out or _beside(found))
+        for flight in flights:
+            if flight.knows_drones:
+                text = json.dumps(flight.summary, indent=2, allow_nan=False) + "\n"
+                (flight.run.folder / "summary.json").write_text(text)
+    typer.echo(str(page))
+
+
+def _beside(found: list[list[Path]]) -> Path:
+    """In the one mission's folder, that of its logs too; in the current folder where there are several."""
+    folders = {path if path.is_dir() else path.parent for paths in found for path in paths}
+    return (folders.pop() if len(folders) == 1 else Path()) / "report.html"
