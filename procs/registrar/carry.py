@@ -25,6 +25,10 @@ MAX_GATE_LENGTHS = 0.6
 MAX_SHIFT_LENGTHS = 0.8  # shared by all boxes: an error of attitude, height or position
 SHIFT_PRICE = 0.5  # of one matched animal, for the largest shift
 VELOCITY_GAIN = 0.15
+# Two animals that touch come as one box about twice as long, whose middle is neither's place. A size is
+# learnt slowly upwards and faster downwards, since a first box may have been such a one.
+MERGED_SIZES = 1.4
+SIZE_GAIN_UP, SIZE_GAIN_DOWN = 0.05, 0.2
 MAX_SPEED_M_S = 4.0
 
 
@@ -35,6 +39,7 @@ class Followed:
     position_m: Array  # (2,) n, e in the drone's own frame
     utime: int
     velocity_m_s: Array = field(default_factory=lambda: np.zeros(2))
+    size_m: float = np.inf  # diagonal of its box on the ground
     animal: int = -1
     candidate: int = -1  # an id that the map offers, and for how many sights running
     n_offers: int = 0
@@ -76,26 +81,36 @@ class BoxCarrier:
         self.sightings: deque[Sighting] = deque()
 
     def update(
-        self, utime: int, boxes: Array, ground_m: Array, whole: NDArray[np.bool_] | None = None
+        self,
+        utime: int,
+        boxes: Array,
+        ground_m: Array,
+        whole: NDArray[np.bool_] | None = None,
+        sizes_m: Array | None = None,
     ) -> Sighting:
         """Add one detected frame: boxes (N, 4) px and their centres on the ground (N, 2) m, own NED frame.
 
         whole (N,): False for a box that the picture's edge cuts: its centre is not the animal's, so nobody is
-        followed by it.
+        followed by it. sizes_m (N,): diagonals on the ground; a box much larger than an animal's is not taken
+        for that animal.
         """
+        sizes = np.full(len(boxes), np.inf) if sizes_m is None else sizes_m
         self._followed = [animal for animal in self._followed if utime - animal.utime <= KEEP_US]
         rows = np.flatnonzero(whole) if whole is not None else np.arange(len(boxes))
-        matches = {int(rows[k]): animal for k, animal in self._associate(utime, ground_m[rows]).items()}
+        matches = {
+            int(rows[k]): animal for k, animal in self._associate(utime, ground_m[rows], sizes[rows]).items()
+        }
         is_whole = set(rows.tolist())
         seen: list[Followed] = []
         for row, position in enumerate(ground_m):
             animal = matches.get(row)
             if animal is None:
-                animal = Followed(position.copy(), utime)
+                animal = Followed(position.copy(), utime, size_m=float(sizes[row]))
                 if row in is_whole:
                     self._followed.append(animal)
             else:
                 _move(animal, position, utime)
+                _grow(animal, float(sizes[row]))
             seen.append(animal)
         sighting = Sighting(utime, boxes, ground_m, tuple(seen))
         self.sightings.append(sighting)
@@ -128,7 +143,7 @@ class BoxCarrier:
         """Ids of animals seen within `within_us` of `utime`."""
         return sorted(a.animal for a in self._followed if a.animal >= 0 and utime - a.utime <= within_us)
 
-    def _associate(self, utime: int, ground_m: Array) -> dict[int, Followed]:
+    def _associate(self, utime: int, ground_m: Array, sizes_m: Array) -> dict[int, Followed]:
         """Row of `ground_m` -> the followed animal that it is."""
         if not len(ground_m) or not self._followed:
             return {}
@@ -137,38 +152,52 @@ class BoxCarrier:
         gate = np.minimum(
             GATE_LENGTHS * self._length_m + GATE_SPEED_M_S * unseen_s, MAX_GATE_LENGTHS * self._length_m
         )
-        shift = _shared_shift(ground_m, predicted, gate, MAX_SHIFT_LENGTHS * self._length_m)
-        rows, columns = _match(ground_m - shift, predicted, gate)
+        fits = sizes_m[:, None] <= MERGED_SIZES * np.array([animal.size_m for animal in self._followed])
+        shift = _shared_shift(ground_m, predicted, gate, fits, MAX_SHIFT_LENGTHS * self._length_m)
+        rows, columns = _match(ground_m - shift, predicted, gate, fits)
         return {int(row): self._followed[column] for row, column in zip(rows, columns, strict=True)}
 
 
-def _shared_shift(points: Array, predicted: Array, gate: Array, limit_m: float) -> Array:
+def _shared_shift(
+    points: Array, predicted: Array, gate: Array, fits: NDArray[np.bool_], limit_m: float
+) -> Array:
     """(2,) m: the shift of all points together under which most of them meet a prediction; none where it
-    gains nothing.
+    gains nothing. fits (points, predictions): which pairs may be one animal.
 
     An error of the drone's attitude or position moves all boxes alike, at times by more than half the
     distance between animals. Each pair (point, prediction) proposes one shift; a large one must earn its
     price in matches.
     """
-    proposals = (points[:, None] - predicted[None]).reshape(-1, 2)
+    proposals = (points[:, None] - predicted[None])[fits]
     proposals = np.vstack([np.zeros(2), proposals[np.linalg.norm(proposals, axis=1) <= limit_m]])
     moved = points[None] - proposals[:, None]  # (shifts, points, 2)
     distance = np.linalg.norm(
         moved[:, :, None] - predicted[None, None], axis=3
     )  # (shifts, points, predictions)
-    closeness = np.clip(1 - (distance / gate) ** 2, 0, None)
+    closeness = np.clip(1 - (distance / gate) ** 2, 0, None) * fits
     price = SHIFT_PRICE * (np.linalg.norm(proposals, axis=1) / limit_m) ** 2
     # The best match of a point and of a prediction, whichever says less: cheap, and no point counts for two.
     score = np.minimum(closeness.max(axis=2).sum(axis=1), closeness.max(axis=1).sum(axis=1)) - price
     return np.asarray(proposals[int(np.argmax(score))])
 
 
-def _match(points: Array, predicted: Array, gate: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Pairs (row, column) of least total distance, each within its column's gate (K,) m."""
+def _match(
+    points: Array, predicted: Array, gate: Array, fits: NDArray[np.bool_]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Pairs (row, column) of least total distance that fit, each within its column's gate (K,) m."""
     distance = np.linalg.norm(points[:, None] - predicted[None], axis=2)
+    distance[~fits] = np.inf
     rows, columns = linear_sum_assignment(np.minimum(distance, gate[None] * 2))
     near = distance[rows, columns] <= gate[columns]
     return rows[near], columns[near]
+
+
+def _grow(animal: Followed, size_m: float) -> None:
+    if not np.isfinite(animal.size_m):
+        animal.size_m = size_m
+    elif np.isfinite(size_m):
+        gain = SIZE_GAIN_UP if size_m > animal.size_m else SIZE_GAIN_DOWN
+        animal.size_m += gain * (size_m - animal.size_m)
 
 
 def _move(animal: Followed, position: Array, utime: int) -> None:

@@ -121,9 +121,11 @@ class Registrar:
         """
         if pose is None or pose.height_m <= 1.0:
             return None
-        centres = (boxes[:, :2] + boxes[:, 2:]) / 2
-        ground = apply_homography(self._camera.image_to_ground(pose), centres)
-        sighting = self.carrier.update(utime, boxes, ground, self._whole(boxes))
+        to_ground = self._camera.image_to_ground(pose)
+        ground = apply_homography(to_ground, (boxes[:, :2] + boxes[:, 2:]) / 2)
+        corners = apply_homography(to_ground, boxes[:, :2]), apply_homography(to_ground, boxes[:, 2:])
+        sizes_m = np.linalg.norm(corners[1] - corners[0], axis=1)
+        sighting = self.carrier.update(utime, boxes, ground, self._whole(boxes), sizes_m)
         if self.finished is not None and self.running is None:
             self._take_up(sighting, pose, fleet_utime)
         return sighting, self._note_sights(sighting, pose, fleet_utime)
@@ -341,22 +343,25 @@ class Registrar:
         held = self.carrier.held_ids(sighting.utime, SEEN_NOW_US)
         if all(one.animal >= 0 for one in sighting.followed) or all(one.animal in held for one in fresh):
             return
+        # A box that the picture's edge cuts has neither its animal's place nor its size: one such made a
+        # whole picture doubtful, and an animal that lay free in its middle went without a name.
+        whole = self._whole(sighting.boxes)
         names = name_by_map(
-            sighting.boxes,
+            sighting.boxes[whole],
             [entry.unturned() for entry in fresh],
             self._view(self.correction.pose(pose)),
             image_size=self._camera.image_size,
             position_std_m=TAKE_UP_STD_LENGTHS * self._length_m,
         )
-        offers = names.identities.tolist()
+        offers = np.full(len(whole), -1, dtype=np.intp)
+        offers[whole] = names.identities
         is_sure = names.confidence >= CONSENSUS_CONFIDENCE and all(
             one.animal < 0 or offer in (-1, one.animal)
-            for one, offer in zip(sighting.followed, offers, strict=True)
+            for one, offer in zip(sighting.followed, offers.tolist(), strict=True)
         )
-        whole = self._whole(sighting.boxes)
-        for one, offer, is_whole in zip(sighting.followed, offers, whole, strict=True):
+        for one, offer in zip(sighting.followed, offers.tolist(), strict=True):
             if one.animal < 0:
-                taken = offer if is_sure and is_whole and offer not in held else -1
+                taken = offer if is_sure and offer not in held else -1
                 if one.offered(taken) >= TAKE_UP_SIGHTS and taken >= 0:
                     self.carrier.name_one(one, taken)
 

@@ -140,6 +140,34 @@ def test_a_box_that_the_pictures_edge_cuts_moves_nobody_and_begins_nobody():
     assert film.see() == named()
 
 
+def test_a_box_round_two_animals_that_touch_is_neither_and_both_keep_their_ids_through_it():
+    film = Film(np.array([[0.0, 0.0], [10.5, 0.0], [5.0, 30.0]]))
+    sizes = np.full(3, 9.0)
+
+    def see(ground: Array, sizes: Array) -> list[int]:
+        film.utime += FRAME_US
+        boxes = np.hstack([ground - 2, ground + 2])
+        return film.carrier.update(film.utime, boxes, ground, None, sizes).ids
+
+    for _ in range(5):
+        assert see(film.animals, sizes) == IDS[:3]
+    for _ in range(8):
+        # Shifted too, so that one shift of all would lay the box of two on either.
+        merged = np.array([[5.2, 1.0], [5.0, 31.0]])
+        assert see(merged, np.array([19.0, 9.0])) == [-1, IDS[2]]
+    assert see(film.animals, sizes) == IDS[:3]
+
+
+def test_a_size_first_seen_too_large_comes_down():
+    film = Film(np.array([[0.0, 0.0]]))
+    for size_m in (18.0, 18.0, *[9.0] * 12):
+        film.utime += FRAME_US
+        film.carrier.update(film.utime, np.zeros((1, 4)), np.zeros((1, 2)), None, np.array([size_m]))
+    film.utime += FRAME_US
+    merged = film.carrier.update(film.utime, np.zeros((1, 4)), np.array([[1.0, 0.0]]), None, np.array([18.0]))
+    assert merged.ids == [-1]
+
+
 def test_a_frame_without_boxes_is_a_frame():
     film = Film()
     assert film.see([]) == {}
