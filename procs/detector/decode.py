@@ -95,7 +95,7 @@ def _raw(output: NDArray[np.float32], oriented: bool, confidence: float) -> Cand
     scores = rows[4:-1] if oriented else rows[4:]
     best = scores[0] if len(scores) == 1 else scores.max(axis=0)
     # Threshold, then gather: few of some thousand cells have anything to say. NaN stays in, to be counted.
-    kept = np.flatnonzero(~(best < confidence))
+    kept = (~(best < confidence)).nonzero()[0]
     classes = np.zeros(len(kept), np.int64) if len(scores) == 1 else scores[:, kept].argmax(axis=0)
     angle_rad = rows[-1, kept] if oriented else None
     return _sound(_upright(rows[:4, kept].T, angle_rad, best[kept], classes), rows.shape[1])
@@ -152,11 +152,12 @@ def _upright(
 
 def _sound(found: Candidates, total: int) -> Candidates:
     """Without rows that are no numbers or no scores; ModelError when they are most of `total`."""
-    # A sum is no number where any of its parts is none.
-    good = np.isfinite(found.boxes.sum(axis=1)) & (found.scores <= MOST_SCORE)
-    n_refused = len(good) - int(np.count_nonzero(good))
-    if n_refused == 0:
+    # A sum is no number where any of its parts is none, and a greatest score is NaN where any of them is.
+    if np.isfinite(found.boxes.sum()) and found.scores.max(initial=0) <= MOST_SCORE:
         return found
+    with np.errstate(invalid="ignore"):
+        good = np.isfinite(found.boxes.sum(axis=1)) & (found.scores <= MOST_SCORE)
+    n_refused = len(good) - int(np.count_nonzero(good))
     if n_refused > MOST_REFUSED_SHARE * total:
         raise ModelError(
             f"{n_refused} of {total} rows of the output are NaN, infinite, or scores above 1; export the "
@@ -173,9 +174,11 @@ def suppress(found: Candidates, iou: float) -> Candidates:
     """
     if len(found.scores) > MOST_CANDIDATES:
         found = found.take(np.argpartition(-found.scores, MOST_CANDIDATES)[:MOST_CANDIDATES])
-    if len(found.scores) > 1:
-        found = found.take(_kept_turned(found, iou) if found.turned is not None else _kept(found, iou))
-    return best_first(found)
+    if len(found.scores) < 2:
+        return found
+    if found.turned is not None:
+        return best_first(found.take(_kept_turned(found, iou)))
+    return found.take(_kept(found, iou)[:MOST_BOXES])
 
 
 def best_first(found: Candidates) -> Candidates:
@@ -184,7 +187,7 @@ def best_first(found: Candidates) -> Candidates:
 
 
 def _kept(found: Candidates, iou: float) -> NDArray[np.int64]:
-    """Which upright boxes stay."""
+    """Which upright boxes stay, best first."""
     sizes = found.boxes.copy()
     sizes[:, 2:] -= sizes[:, :2]
     # Lists, not arrays: the binding converts an array element by element, four times slower.

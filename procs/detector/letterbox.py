@@ -57,6 +57,7 @@ class _Buffers:
         self._steps = [(np.empty((h, w, 3), np.uint8), how) for w, h, how in shrink_steps(picture, inner)]
         planes = np.empty((3, inner[1], inner[0]), np.uint8)
         self._split = [planes[2], planes[1], planes[0]]  # BGR comes, RGB goes
+        self._scale = dtype(1 / 255)
         tensor = np.full((1, 3, height, width), PAD_GREY / 255, dtype)
         self._inner = tensor[0, :, top : top + inner[1], left : left + inner[0]]
         scale = (inner[0] / picture[0], inner[1] / picture[1])
@@ -70,7 +71,7 @@ class _Buffers:
             image = buffer
         cv2.split(image, self._split)
         self._inner[...] = self._fitted.planes
-        np.multiply(self._inner, self._inner.dtype.type(1 / 255), out=self._inner)
+        np.multiply(self._inner, self._scale, out=self._inner)
         return self._fitted
 
 

@@ -46,8 +46,8 @@ class Network:
     def __init__(self, path: Path, provider: str = "cpu") -> None:
         self.path = path
         self.warning = ""
-        self._session = self._open(provider)
-        self._metadata = dict(self._session.get_modelmeta().custom_metadata_map)
+        self.session = self._open(provider)
+        self._metadata = dict(self.session.get_modelmeta().custom_metadata_map)
         self._task = self._metadata.get("task")
         if self._task not in (None, *TASKS):
             raise ModelError(
@@ -61,7 +61,7 @@ class Network:
     def run(self, tensor: NDArray[np.generic]) -> NDArray[np.float32]:
         """The output for a (1, 3, height, width) input. Raises ModelError."""
         try:
-            output = self._session.run(self._outputs, {self._input: tensor})[0]
+            output = self.session.run(self._outputs, {self._input: tensor})[0]
         except (
             Exception
         ) as error:  # onnxruntime raises a dozen types of its own, all of them the model's fault
@@ -134,7 +134,7 @@ class Network:
 
     def _read_input(self) -> tuple[int, int]:
         """(width, height) that the network takes; also notes its input's name and type."""
-        inputs = self._session.get_inputs()
+        inputs = self.session.get_inputs()
         described = ", ".join(f"{item.name} {item.type} {item.shape}" for item in inputs)
         problem = ""
         shape = list(inputs[0].shape) if inputs else []
@@ -167,7 +167,7 @@ class Network:
         return sides[0], sides[1]
 
     def _read_output(self) -> None:
-        outputs = self._session.get_outputs()
+        outputs = self.session.get_outputs()
         if len(outputs) != 1 and self._task is None:
             described = ", ".join(f"{item.name} {item.shape}" for item in outputs)
             raise ModelError(

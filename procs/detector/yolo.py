@@ -115,18 +115,18 @@ class Detector:
             timings["decode"] += (time.perf_counter() - begun) * 1e3
         begun = time.perf_counter()
         # The whole comes last: where a tile has an animal too, it has it larger.
-        found = merge([*looks, whole]) if looks else whole
-        boxes = np.clip(found.boxes, 0, np.array([width, height, width, height], np.float32))
-        real = np.flatnonzero(np.all(boxes[:, 2:] > boxes[:, :2], axis=1))
-        best = real[np.argsort(-found.scores[real], kind="stable")]
-        boxes = boxes[best]
+        found = best_first(merge([*looks, whole])) if looks else whole
+        limit = np.array([width, height, width, height], np.float32)
+        boxes = np.minimum(np.maximum(found.boxes, 0), limit)
+        real = ((boxes[:, 2] > boxes[:, 0]) & (boxes[:, 3] > boxes[:, 1])).nonzero()[0]
+        boxes = boxes[real]
         if self._tile == "auto":
             self._seen_length.see(boxes)
         timings["decode"] += (time.perf_counter() - begun) * 1e3
         return Detections(
             boxes,
-            found.scores[best],
-            found.classes[best],
+            found.scores[real],
+            found.classes[real],
             self.names,
             timings,
             1 + len(looks),
@@ -138,9 +138,7 @@ class Detector:
         """What the network finds in one picture or tile, in its pixels."""
         begun = time.perf_counter()
         fitted = self._letterbox.fit(image)
-        if is_whole:
-            self._sight.look(fitted.planes)
-        is_flat = self._sight.is_flat(fitted.planes)
+        is_flat = self._sight.look(fitted.planes) if is_whole else self._sight.is_flat(fitted.planes)
         prepared = time.perf_counter()
         timings["prepare"] += (prepared - begun) * 1e3
         if is_flat:
