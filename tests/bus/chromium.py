@@ -5,6 +5,7 @@ DevTools Protocol, `--remote-debugging-pipe`).
 """
 
 import base64
+import fcntl
 import json
 import os
 import select
@@ -26,7 +27,13 @@ FLAGS = (
     "--disable-default-apps", "--hide-scrollbars", "--remote-debugging-pipe",
 )  # fmt: skip
 # The browser wants its pipes as 3 and 4; subprocess alone cannot renumber them.
-RENUMBER = "import os, sys; a, b = int(sys.argv[1]), int(sys.argv[2]); os.dup2(a, 3); os.dup2(b, 4); os.execvp(sys.argv[3], sys.argv[3:])"  # noqa: E501
+RENUMBER = """
+import os, sys
+os.dup2(int(sys.argv[1]), 3)
+os.dup2(int(sys.argv[2]), 4)
+os.execvp(sys.argv[3], sys.argv[3:])
+"""
+LEAST_FREE = 10  # so that renumbering overwrites neither pipe
 
 
 def find_chromium() -> str | None:
@@ -143,8 +150,7 @@ def chromium(command: str, profile: Path) -> Iterator[Page]:
     """A fresh browser with a profile of its own, ended with all that it started."""
     read_command, write_command = os.pipe()
     read_answer, write_answer = os.pipe()
-    # Above 4, so that renumbering overwrites neither.
-    ends = [os.dup(read_command), os.dup(write_answer)]
+    ends = [fcntl.fcntl(end, fcntl.F_DUPFD, LEAST_FREE) for end in (read_command, write_answer)]
     with (profile / "chromium.txt").open("wb") as said:
         browser = subprocess.Popen(
             [sys.executable, "-c", RENUMBER, *map(str, ends), command, *FLAGS, f"--user-data-dir={profile}"],

@@ -7,6 +7,7 @@ import re
 from html.parser import HTMLParser
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from typer.testing import CliRunner
@@ -222,8 +223,17 @@ def test_each_named_animal_has_a_best_picture_under_its_true_number(folder: Path
     best = best_stills(read_flight([folder]))
     assert set(best) >= {1, 2, 3}
     for number, still in best.items():
-        [mark] = [mark for mark in still.marks if mark.number == number]
-        assert 0 <= mark.x < mark.x + mark.width <= still.width == 320
+        [mark] = still.marks
+        assert mark.number == number
+        assert 0 <= mark.x < mark.x + mark.width <= still.width
+        assert 288 <= still.width <= 640
+        assert still.width / still.height == pytest.approx(4 / 3, rel=0.02)
+        image = cv2.imdecode(np.frombuffer(still.jpeg, np.uint8), cv2.IMREAD_GRAYSCALE)
+        assert image.shape == (still.height, still.width)
+        inside = image[int(mark.y) + 4 : int(mark.y + mark.height) - 4, int(mark.x) + 4 :][
+            :, : int(mark.width) - 8
+        ]
+        assert inside.mean() < image.mean() - 1, "the animal, darker than the sea, lies in its box"
 
 
 def test_black_pictures_are_nobodys_best(tmp_path: Path) -> None:
@@ -407,6 +417,19 @@ def test_the_command_writes_the_page_and_a_runs_summary(tmp_path: Path) -> None:
     result = CliRunner().invoke(app, ["report", str(tmp_path / "gone")])
     assert result.exit_code == 2
     assert "no such file or folder" in result.stderr
+
+
+def test_a_day_leaves_out_a_mission_that_cannot_be_read_and_says_so(tmp_path: Path) -> None:
+    MappedRun(duration_s=16, monitor_s=(5, 12)).write(tmp_path / "day" / "b")
+    (tmp_path / "day" / "a").mkdir()
+    (tmp_path / "day" / "a" / "drone_1.mcap").write_bytes(b"")
+    result = CliRunner().invoke(app, ["report", str(tmp_path / "day"), "--out", str(tmp_path / "day.html")])
+    assert result.exit_code == 0
+    assert "left out: " in result.stderr
+    assert "drone_1.mcap: is empty (0 bytes)" in result.stderr
+    assert "Each drone kept an animal" in words_of((tmp_path / "day.html").read_text(encoding="utf-8"))
+    result = CliRunner().invoke(app, ["report", str(tmp_path / "day" / "a")])
+    assert (result.exit_code, result.stdout) == (2, "")
 
 
 def test_a_scene_without_labels_shows_what_the_drones_say(tmp_path: Path) -> None:

@@ -29,8 +29,8 @@ class LineChart {
     const values = this.chart.curves.flatMap((curve) => curve.values).filter((value) => value !== null);
     const most = Math.max(...values, this.chart.mark ? this.chart.mark[0] : 0, 1e-9);
     if (this.chart.top) return this.chart.top;
-    const nice = niceLength(most);
-    return Math.ceil((most * 1.02) / nice) * nice;
+    const power = 10 ** Math.floor(Math.log10(most));
+    return [1, 1.5, 2, 2.5, 3, 4, 5, 6, 8, 10, 12].map((step) => step * power).find((top) => top >= most * 1.05);
   }
 
   draw() {
@@ -49,9 +49,11 @@ class LineChart {
       const text = make(this.svg, "text", { x: MARGIN.left - 6, y: y(share * top) + 4, "text-anchor": "end" });
       text.textContent = String(Number((share * top).toPrecision(3)));
     }
-    for (const share of [0, 0.25, 0.5, 0.75]) {
-      const text = make(this.svg, "text", { x: x(share * this.end), y: height - 5, "text-anchor": share ? "middle" : "start" });
-      text.textContent = this.clock(share * this.end);
+    const steps = [10, 20, 30, 60, 120, 300, 600, 1200, 1800, 3600, 7200];
+    const step = steps.find((one) => this.end / one <= 5) || 14400;
+    for (let t = 0; t < this.end * 0.95; t += step) {
+      const text = make(this.svg, "text", { x: x(t), y: height - 5, "text-anchor": t ? "middle" : "start" });
+      text.textContent = this.clock(t);
     }
     if (this.chart.mark) {
       const [level, words] = this.chart.mark;

@@ -2,11 +2,14 @@
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from tools.errors import plain_errors
+
+if TYPE_CHECKING:
+    from tools.report.flights import Flight
 
 __all__ = ["report"]
 
@@ -29,18 +32,37 @@ def report(
     ] = None,
 ) -> None:
     """Make report.html: what went wrong, where all flew, who watched whom, pictures and figures."""
-    from tools.report.flights import find_flights, read_flight
+    from tools.report.flights import find_flights
     from tools.report.page import write_report
 
     with plain_errors():
         found = find_flights(paths)
-        flights = [read_flight(logs) for logs in found]
+        flights = _readable(found)
         page = write_report(flights, out or _beside(found))
         for flight in flights:
             if flight.knows_drones:
                 text = json.dumps(flight.summary, indent=2, allow_nan=False) + "\n"
                 (flight.run.folder / "summary.json").write_text(text)
     typer.echo(str(page))
+
+
+def _readable(found: list[list[Path]]) -> list["Flight"]:
+    """Every mission that can be read; of a day, those that cannot are told on stderr and left out.
+
+    Raises LogError where none is left.
+    """
+    from logs.exceptions import LogError
+    from tools.report.flights import read_flight
+
+    flights = []
+    for logs in found:
+        try:
+            flights.append(read_flight(logs))
+        except LogError as error:
+            if len(found) == 1 or (logs is found[-1] and not flights):
+                raise
+            typer.echo(f"podwatch: left out: {error}", err=True)
+    return flights
 
 
 def _beside(found: list[list[Path]]) -> Path:

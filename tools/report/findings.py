@@ -49,6 +49,7 @@ class Finding:
     rank: int  # GRAVE, WRONG or NOTE
     text: str
     at_s: float | None = None
+    is_last: bool = False  # of its rank
 
 
 def sentence(flight: Flight, watched: dict[int, list[Span]]) -> tuple[bool | None, str]:
@@ -87,7 +88,9 @@ def find_findings(flight: Flight, watched: dict[int, list[Span]], is_good: bool 
         *_notes(flight),
     ]
     once = {finding.text: finding for finding in reversed(found)}
-    return sorted(once.values(), key=lambda f: (f.rank, f.at_s if f.at_s is not None else -1.0, f.text))
+    return sorted(
+        once.values(), key=lambda f: (f.rank, f.is_last, -1.0 if f.at_s is None else f.at_s, f.text)
+    )
 
 
 def _judged(flight: Flight, watched: dict[int, list[Span]], is_good: bool | None) -> Iterator[Finding]:
@@ -238,7 +241,7 @@ def _notes(flight: Flight) -> Iterator[Finding]:
             f"Not everything could be read ({places}), so something may be missing here; see “What could not "
             "be read” below."
         )
-        yield Finding(WRONG, text)
+        yield Finding(WRONG, text, None, is_last=True)
     if flight.summary["sensor"] == "boxes":
         text = "Simulated without pictures: what the cameras saw was drawn by lot, with measured errors."
         yield Finding(NOTE, text)

@@ -95,14 +95,20 @@ class FleetMap {
     this.width = width;
     this.height = height;
     this.svg.setAttribute("viewBox", `0 0 ${width} ${height}`);
-    if (isFirst) this.fit("all");
+    if (isFirst) this.fit("watch");
     else this.moved();
   }
 
+  // Show all that is worth it: the "animals", everything while somebody watched ("watch"), or "all".
   fit(what) {
     const things = what === "animals" && this.animals.length ? this.animals : [...this.drones, ...this.animals];
-    const east = things.flatMap((thing) => thing.e).filter((value) => value !== null);
-    const north = things.flatMap((thing) => thing.n).filter((value) => value !== null);
+    const spans = what === "all" ? [] : this.drones.flatMap((drone) => drone.watched);
+    const from = spans.length ? Math.min(...spans.map((span) => span[0])) : 0;
+    const to = spans.length ? Math.max(...spans.map((span) => span[1])) : this.data.end;
+    const first = Math.floor(from / this.data.step);
+    const last = Math.ceil(to / this.data.step) + 1;
+    const east = things.flatMap((thing) => thing.e.slice(first, last)).filter((value) => value !== null);
+    const north = things.flatMap((thing) => thing.n.slice(first, last)).filter((value) => value !== null);
     if (east.length && north.length) {
       const low = [Math.min(...east) / 10, Math.min(...north) / 10];
       const high = [Math.max(...east) / 10, Math.max(...north) / 10];

@@ -140,7 +140,7 @@ def render(sections: Sequence[Section]) -> str:
     )
     environment.filters.update(
         clock=words.clock,
-        lasting=words.lasting,
+        lasting=lambda span_s: words.lasting(span_s).replace(" ", "\xa0"),
         state_words=words.state_words,
         state_colour=words.state_colour,
         kind_words=lambda kind: words.KIND_WORDS.get(kind, kind),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -21,6 +21,9 @@ __all__ = ["Mark", "Still", "best_stills", "camera_stills"]
 SIGHT_S = 0.3  # boxes and tracks this near in time to a picture are drawn on it
 LOOKED_AT = 8  # of the likeliest pictures of an animal are decoded
 LEAST_CONTRAST = 1.0  # grey levels; a picture with less is black, or empty
+ODD = 1.3  # times an animal's usual size: a box round two
+ROUND_ABOUT = 1.7  # times its box is cut out round an animal
+LEAST_CUT = 0.45  # of the picture's width; less would only show pixels
 JPEG_START = b"\xff\xd8"
 
 
@@ -53,7 +56,7 @@ class Still:
 
 
 def best_stills(flight: Flight) -> dict[int, Still]:
-    """Animal -> its best picture: large, whole, in the middle, sharp."""
+    """Animal -> its best picture, cut out round it: large, whole, in the middle, sharp."""
     rated: dict[int, list[tuple[float, Still, Mark]]] = {}
     for log in flight.run.drones:
         for still in _stills(flight, log.id, _previews(flight, log.id)):
@@ -62,11 +65,14 @@ def best_stills(flight: Flight) -> dict[int, Still]:
                     rated.setdefault(mark.number, []).append((_size_and_place(still, mark), still, mark))
     best = {}
     for number, entries in sorted(rated.items()):
-        entries.sort(key=lambda entry: -entry[0])
-        looked = [(score * _sharpness(still, mark), still) for score, still, mark in entries[:LOOKED_AT]]
-        score, still = max(looked, key=lambda entry: entry[0])
+        usual_px = float(np.median([_diagonal(mark) for _, _, mark in entries]))
+        entries.sort(key=lambda entry: -entry[0] * (_diagonal(entry[2]) <= ODD * usual_px))
+        looked = [
+            (score * _sharpness(still, mark), still, mark) for score, still, mark in entries[:LOOKED_AT]
+        ]
+        score, still, mark = max(looked, key=lambda entry: entry[0])
         if score > 0:
-            best[number] = still
+            best[number] = _cut_out(still, mark)
     return best
 
 
@@ -148,13 +154,35 @@ class _Nearest:
 
 
 def _size_and_place(still: Still, mark: Mark) -> float:
-    """0-1: the box's share of the picture, less for a box at its edge or far from its middle."""
+    """The box's share of the picture; less at its edge or far from its middle, more where it is tracked."""
     size = min(mark.width * mark.height / (still.width * still.height), 0.25) / 0.25
     u, v = mark.x + mark.width / 2, mark.y + mark.height / 2
     off = np.hypot(u / still.width - 0.5, v / still.height - 0.5)
     is_whole = mark.x > 1 and mark.y > 1
     is_whole &= mark.x + mark.width < still.width - 1 and mark.y + mark.height < still.height - 1
-    return float((0.2 + size) * (1.2 - off) * (1.0 if is_whole else 0.4))
+    return float((0.2 + size) * (1.2 - off) * (1.0 if is_whole else 0.4) * (1.5 if mark.is_own else 1.0))
+
+
+def _diagonal(mark: Mark) -> float:
+    return float(np.hypot(mark.width, mark.height))
+
+
+def _cut_out(still: Still, mark: Mark) -> Still:
+    """The part of a picture round one box, in the picture's own proportions, at most as large as it is."""
+    share = max(mark.width / still.width, mark.height / still.height) * ROUND_ABOUT
+    share = min(max(share, LEAST_CUT), 1.0)
+    width, height = round(share * still.width), round(share * still.height)
+    left = round(min(max(mark.x + mark.width / 2 - width / 2, 0), still.width - width))
+    top = round(min(max(mark.y + mark.height / 2 - height / 2, 0), still.height - height))
+    image = np.asarray(cv2.imdecode(np.frombuffer(still.jpeg, np.uint8), cv2.IMREAD_COLOR))
+    image = cv2.resize(
+        image[top : top + height, left : left + width], None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC
+    )
+    _, jpeg = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 82])
+    cut = replace(
+        mark, x=2 * (mark.x - left), y=2 * (mark.y - top), width=2 * mark.width, height=2 * mark.height
+    )
+    return replace(still, width=2 * width, height=2 * height, jpeg=jpeg.tobytes(), marks=(cut,))
 
 
 def _sharpness(still: Still, mark: Mark) -> float:
