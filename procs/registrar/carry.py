@@ -22,6 +22,9 @@ KEEP_US = 8_000_000  # frames remembered, and how long an unseen animal is
 GATE_LENGTHS = 0.25
 GATE_SPEED_M_S = 0.7
 MAX_GATE_LENGTHS = 0.6
+# A box that suits an animal that has none now nearly as well is neither's: when two come apart again, the
+# first box to be seen lies between where they were.
+AMBIGUOUS_LENGTHS = 0.25
 MAX_SHIFT_LENGTHS = 0.8  # shared by all boxes: an error of attitude, height or position
 SHIFT_PRICE = 0.5  # of one matched animal, for the largest shift
 VELOCITY_GAIN = 0.15
@@ -154,7 +157,10 @@ class BoxCarrier:
         )
         fits = sizes_m[:, None] <= MERGED_SIZES * np.array([animal.size_m for animal in self._followed])
         shift = _shared_shift(ground_m, predicted, gate, fits, MAX_SHIFT_LENGTHS * self._length_m)
-        rows, columns = _match(ground_m - shift, predicted, gate, fits)
+        distance = np.linalg.norm((ground_m - shift)[:, None] - predicted[None], axis=2)
+        distance[~fits] = np.inf
+        named = np.array([animal.animal >= 0 for animal in self._followed])
+        rows, columns = _match(distance, gate, named, AMBIGUOUS_LENGTHS * self._length_m)
         return {int(row): self._followed[column] for row, column in zip(rows, columns, strict=True)}
 
 
@@ -182,14 +188,20 @@ def _shared_shift(
 
 
 def _match(
-    points: Array, predicted: Array, gate: Array, fits: NDArray[np.bool_]
+    distance: Array, gate: Array, named: NDArray[np.bool_], ambiguous_m: float
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Pairs (row, column) of least total distance that fit, each within its column's gate (K,) m."""
-    distance = np.linalg.norm(points[:, None] - predicted[None], axis=2)
-    distance[~fits] = np.inf
+    """Pairs (row, column) of least total distance (N, K) m, each within its column's gate (K,) m. A row gets
+    no named column (K,) where another one without a row would suit within `ambiguous_m` as well.
+    """
     rows, columns = linear_sum_assignment(np.minimum(distance, gate[None] * 2))
     near = distance[rows, columns] <= gate[columns]
-    return rows[near], columns[near]
+    rows, columns = rows[near], columns[near]
+    waiting = distance.copy()
+    waiting[:, columns] = np.inf
+    waiting[:, ~named] = np.inf
+    clear = waiting[rows].min(axis=1, initial=np.inf) > distance[rows, columns] + ambiguous_m
+    clear |= ~named[columns]
+    return rows[clear], columns[clear]
 
 
 def _grow(animal: Followed, size_m: float) -> None:

@@ -158,6 +158,19 @@ def test_a_box_round_two_animals_that_touch_is_neither_and_both_keep_their_ids_t
     assert see(film.animals, sizes) == IDS[:3]
 
 
+def test_the_first_box_after_two_came_together_is_given_neithers_id():
+    """It lies between where they were: the map's offers say later whose it is (docs/registration.md)."""
+    film = Film(np.array([[0.0, 0.0], [6.5, 0.0], [5.0, 30.0]]))
+    assert film.see([0, 1, 2]) == named([0, 1, 2])
+    for _ in range(5):
+        film.see([2])
+    film.animals[0] = [3.0, 0.0]
+    assert film.see([0, 2]) == {0: -1, 2: IDS[2]}
+    film.animals[:2] = [[0.3, 0.0], [6.3, 0.0]]
+    after = film.see([0, 1, 2])
+    assert (after[0], after[1]) in ((-1, IDS[1]), (IDS[0], IDS[1]))
+
+
 def test_a_size_first_seen_too_large_comes_down():
     film = Film(np.array([[0.0, 0.0]]))
     for size_m in (18.0, 18.0, *[9.0] * 12):

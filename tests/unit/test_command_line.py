@@ -16,7 +16,7 @@ from procs.detector.yolo import ModelError
 from procs.settings import MissionError
 from tools import errors
 from tools.cli import app
-from tools.sim import command, run
+from tools.sim import flight, run
 from tools.sim.watch import Watch
 from tools.supervision import CannotStartError, SupervisorError
 
@@ -63,7 +63,7 @@ def test_a_mission_file_that_is_not_there_or_is_a_folder_or_no_toml(tmp_path):
 def test_a_folder_of_a_missions_name_does_not_hide_the_mission(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "default").mkdir()
-    assert command.read_mission("default").name == "default"
+    assert flight.read_mission("default").name == "default"
 
 
 def test_an_out_that_cannot_be_written_is_told_before_anything_flies(tmp_path):
@@ -105,14 +105,14 @@ def test_boxes_in_place_of_pixels_cannot_look_at_a_picture(tmp_path):
     ],
 )
 def test_addresses_of_autopilots_that_cannot_be(tmp_path, monkeypatch, options, words):
-    monkeypatch.setattr(command, "has_multicast_route", lambda: True)
+    monkeypatch.setattr(flight, "has_multicast_route", lambda: True)
     assert words in refused(tmp_path, *options)
 
 
 def test_addresses_are_taken_in_every_form(monkeypatch):
-    mission = command.with_overrides(command.read_mission("default"), drones=4)
+    mission = flight.with_overrides(flight.read_mission("default"), drones=4)
     text = "127.0.0.1:14550, udpout:10.0.0.2:1,tcp:sitl:5760,serial:/dev/ttyAMA0:57600"
-    assert command._addresses(text, mission, lockstep=False, fallback="") == (
+    assert flight._addresses(text, mission, lockstep=False, fallback="") == (
         "udp:127.0.0.1:14550",
         "udpout:10.0.0.2:1",
         "tcp:sitl:5760",
@@ -155,7 +155,7 @@ def test_ctrl_c_before_anything_flew_leaves_nothing_to_judge(tmp_path, monkeypat
     def stopped(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(command, "fly_lockstep", stopped)
+    monkeypatch.setattr(flight, "fly_lockstep", stopped)
     result = podwatch("sim", "--drones", 1, "--out", tmp_path, *QUICK)
     assert result.exit_code == errors.INTERRUPTED
     assert "Stopped before anything flew" in result.stderr
@@ -186,7 +186,7 @@ def test_a_fault_of_ours_keeps_its_traceback():
 
 
 def test_a_key_that_the_mission_names_is_used_and_never_replaced(tmp_path):
-    mission = command.read_mission("one_drone")
+    mission = flight.read_mission("one_drone")
     key = tmp_path / "fleet.key"
     plan: Any = type("Plan", (), {"mission": mission, "folder": tmp_path})
     run.prepare(plan)

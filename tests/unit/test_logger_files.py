@@ -14,7 +14,7 @@ from procs.logger.files import LogFiles, SegmentedLog
 from procs.queue_executor import ClockError, EventQueue, QueueRuntime, VirtualBus
 from procs.settings import DroneSettings, LogSettings, Mission
 from tools.cli import app
-from tools.sim.command import read_mission, with_overrides
+from tools.sim.flight import read_mission, with_overrides
 
 SECOND_US = 1_000_000
 

@@ -17,7 +17,7 @@ from logs.reader import read
 from procs import processes
 from tools.bench.table import Row, bench_console, measured, print_table, write_table
 from tools.folders import new_folder
-from tools.sim.command import read_mission, with_overrides
+from tools.sim.flight import read_mission, with_overrides
 from tools.sim.lockstep import LockstepFleet
 from tools.sim.plan import RunPlan
 from tools.sim.run import finish, fly_lockstep, fly_processes, prepare

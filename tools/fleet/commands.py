@@ -7,7 +7,6 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
-from procs.settings import MAX_DRONES, MissionError
 from tools.errors import MISSING, plain_errors
 
 __all__ = ["app"]
@@ -20,13 +19,16 @@ FleetFile = Annotated[Path, typer.Argument(help="The fleet file.", show_default=
 @app.command("new")
 def new(
     path: FleetFile = Path("fleet.toml"),
-    drones: Annotated[int, typer.Option(min=1, max=MAX_DRONES, help="How many drones.")] = 3,
+    drones: Annotated[int, typer.Option(min=1, help="How many drones.")] = 3,
     name: Annotated[str, typer.Option(help="What the fleet is called. [default: the file's name]")] = "",
 ) -> None:
     """Write a fleet file with a comment on every value that people change."""
+    from procs.settings import MAX_DRONES, MissionError
     from tools.fleet.template import fleet_text
 
     with plain_errors():
+        if drones > MAX_DRONES:
+            raise MissionError(f"--drones {drones}: a fleet holds at most {MAX_DRONES}")
         if path.exists():
             raise MissionError(f"{path} exists already; name another file, or edit this one")
         if '"' in name or "\\" in name:
@@ -42,6 +44,7 @@ def keys(
 ) -> None:
     """Make the fleet key, readable by its owner alone; copy it to every drone and the boat."""
     from procs.relay.keys import make_key
+    from procs.settings import MissionError
     from tools.fleet.machine import read_fleet
 
     with plain_errors():
