@@ -82,11 +82,12 @@ def decode(
 
     Raises ModelError where most rows are no numbers, or the boxes are no pixels.
     """
-    if layout.kind == "raw":
-        return _raw(output, layout.oriented, confidence)
-    if layout.kind == "queries":
-        return _queries(output, confidence, size)
-    return _finished(output, layout.oriented, confidence)
+    with np.errstate(invalid="ignore", over="ignore"):  # what comes of infinities is NaN, and is left out
+        if layout.kind == "raw":
+            return _raw(output, layout.oriented, confidence)
+        if layout.kind == "queries":
+            return _queries(output, confidence, size)
+        return _finished(output, layout.oriented, confidence)
 
 
 def _raw(output: NDArray[np.float32], oriented: bool, confidence: float) -> Candidates:
@@ -143,9 +144,8 @@ def _upright(
     turned = None
     if angle_rad is not None:
         turned = np.column_stack([boxes, angle_rad])
-        with np.errstate(invalid="ignore"):  # an infinite angle gives NaN, which `_sound` leaves out
-            cosine, sine = np.abs(np.cos(angle_rad))[:, None], np.abs(np.sin(angle_rad))[:, None]
-            size = size * cosine + size[:, ::-1] * sine
+        cosine, sine = np.abs(np.cos(angle_rad))[:, None], np.abs(np.sin(angle_rad))[:, None]
+        size = size * cosine + size[:, ::-1] * sine
     half = size * np.float32(0.5)
     return Candidates(np.concatenate([centre - half, centre + half], axis=1), scores, classes, turned)
 
@@ -155,8 +155,7 @@ def _sound(found: Candidates, total: int) -> Candidates:
     # A sum is no number where any of its parts is none, and a greatest score is NaN where any of them is.
     if np.isfinite(found.boxes.sum()) and found.scores.max(initial=0) <= MOST_SCORE:
         return found
-    with np.errstate(invalid="ignore"):
-        good = np.isfinite(found.boxes.sum(axis=1)) & (found.scores <= MOST_SCORE)
+    good = np.isfinite(found.boxes.sum(axis=1)) & (found.scores <= MOST_SCORE)
     n_refused = len(good) - int(np.count_nonzero(good))
     if n_refused > MOST_REFUSED_SHARE * total:
         raise ModelError(

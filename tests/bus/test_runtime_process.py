@@ -3,25 +3,20 @@
 import os
 import select
 import signal
-import socket
-import subprocess
-import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import lcm
 import pytest
 
 from lcmtypes import channels, make
-from lcmtypes.podwatch import heartbeat_t, setpoint_t, track_t
+from lcmtypes.podwatch import track_t
 from procs import processes
 from procs.bus_executor import HARD_STOP_S
-from procs.settings import DriverSpec, DroneSettings, Mission
+from procs.settings import DriverSpec
+from tests.bus.process_bench import DEADLINE_S, Bench
 
-ROOT = Path(__file__).parents[2]
-DEADLINE_S = 40.0
 EXIT_CANNOT_START = 3
 # A process whose handler of TRACK is busy, deaf or hung, as its second argument says.
 SHELL = """
@@ -45,55 +40,6 @@ runtime.on(channels.TRACK, handle)
 runtime.on_stop(lambda: runtime.publish(channels.SETPOINT, make(setpoint_t, utime=3)))
 runtime.run()
 """
-
-
-class Bench:
-    """A bus, what is said on it, and one process."""
-
-    def __init__(self, folder: Path) -> None:
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-            probe.bind(("", 0))
-            url = f"udpm://239.255.76.194:{probe.getsockname()[1]}?ttl=0&recv_buf_size=4194304"
-        self.settings = DroneSettings(
-            drone_id=2, mission=Mission(), bus_url=url, run_dir=str(folder), log_path=str(folder / "log.mcap")
-        )
-        self._folder = folder
-        self.bus = lcm.LCM(url)
-        self.bus.subscribe(channels.SETPOINT, self._hear_setpoint)
-        self.bus.subscribe(channels.HEARTBEAT, self._hear_beat)
-        self.setpoints: list[int] = []
-        self.beats: list[heartbeat_t] = []
-        self.process: subprocess.Popen[str] | None = None
-
-    def start(self, *command: str) -> None:
-        path = self._folder / "drone.json"
-        path.write_text(self.settings.model_dump_json())
-        words = [str(path) if word == "SETTINGS" else word for word in command]
-        self.process = subprocess.Popen(
-            [sys.executable, *words], cwd=ROOT, stderr=subprocess.PIPE, text=True, start_new_session=True
-        )
-
-    def await_that(self, what: Callable[[], object]) -> None:
-        deadline = time.monotonic() + DEADLINE_S
-        while not what():
-            assert time.monotonic() < deadline
-            if self.process is not None and self.process.poll() is not None:
-                pytest.fail(f"it ended with {self.end()}")
-            self.bus.handle_timeout(50)
-
-    def end(self) -> tuple[int, str]:
-        """The exit code of the process, once it has ended, and what it said."""
-        assert self.process is not None
-        _, said = self.process.communicate(timeout=DEADLINE_S)
-        while self.bus.handle_timeout(0) > 0:
-            pass
-        return self.process.returncode, said
-
-    def _hear_setpoint(self, _channel: str, data: bytes) -> None:
-        self.setpoints.append(setpoint_t.decode(data).utime)
-
-    def _hear_beat(self, _channel: str, data: bytes) -> None:
-        self.beats.append(heartbeat_t.decode(data))
 
 
 @pytest.fixture
@@ -218,7 +164,7 @@ def test_without_a_multicast_route_it_says_which_command_to_run(bench):
     """In a network of its own that has no route; where that is not allowed, with a group that cannot be."""
     said = cannot_start(bench, "-c", NO_ROUTE, "SETTINGS")
     assert "navigator: no bus at udpm://" in said
-    assert "ip route add 224.0.0.0/4 dev lo" in said
+    assert "ip route replace 239.255.76.0/24 dev lo" in said
 
 
 def test_a_process_that_cannot_start_says_what_is_wrong_in_one_line(bench, tmp_path):
