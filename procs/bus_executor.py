@@ -20,7 +20,10 @@ from procs.notify import Notifier
 from procs.runtime import HEARTBEAT_PERIOD_S, Runtime, RuntimeFailure, Subscription, Transport
 from procs.settings import DriverSpec, DroneSettings
 
-__all__ = ["BusRuntime", "load_driver"]
+__all__ = ["ROUTE_COMMAND", "BusRuntime", "load_driver"]
+
+# A route for the groups of all drones (docs/architecture.md), over the loopback: a bus stays on its drone.
+ROUTE_COMMAND = "ip route replace 239.255.76.0/24 dev lo"
 
 # Deep enough for the longest handler: messages wait in C for as long as one handler runs.
 C_QUEUE_CAPACITY = 2000
@@ -65,8 +68,7 @@ class BusRuntime(Runtime):
             self._lcm = lcm.LCM(settings.bus_url)
         except RuntimeError as error:
             raise RuntimeFailure(
-                f"no bus at {settings.bus_url} ({error}); is there a multicast route? Try: "
-                "ip route add 224.0.0.0/4 dev lo"
+                f"no bus at {settings.bus_url} ({error}); is there a multicast route? Try: {ROUTE_COMMAND}"
             ) from error
         self._transports: list[tuple[Transport, Callable[[], None]]] = []
         self._ready: list[Any] = []

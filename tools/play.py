@@ -96,6 +96,7 @@ def _open_buses(
     """Each drone's bus; the slot is held for as long as they are open."""
     import lcm
 
+    from procs.bus_executor import ROUTE_COMMAND
     from procs.runtime import RuntimeFailure
     from tools.buses import Slot, bus_url
 
@@ -108,7 +109,7 @@ def _open_buses(
         except RuntimeError as error:
             raise RuntimeFailure(
                 f"no bus at {', '.join(urls.values())} ({error}); is there a multicast route? Try: "
-                "ip route add 224.0.0.0/4 dev lo"
+                f"{ROUTE_COMMAND}"
             ) from error
         for drone_id, url in urls.items():
             console.print(f"drone {drone_id} on {url}", soft_wrap=True)

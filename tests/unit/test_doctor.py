@@ -22,7 +22,7 @@ from tools.cli import app
 from tools.doctor import machine
 from tools.doctor.drone import check_autopilot
 from tools.doctor.mend import as_root
-from tools.fleet.check import Finding
+from tools.findings import Finding
 
 PODWATCH = f"{sys.executable} -c 'from tools.cli import main; main()'"
 NAMESPACES = ("unshare", "--map-root-user", "--mount", "--net")

@@ -17,6 +17,7 @@ from procs.settings import Mission, MissionError, load_mission
 from tools import errors
 from tools.buses import free_udp_ports
 from tools.cli import app
+from tools.findings import Finding
 from tools.fleet import check
 from tools.fleet.machine import boat_radio, drone_settings, machine_of, read_fleet
 from tools.sim.settings import SimMission
@@ -47,7 +48,7 @@ def bench(fleet: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         text = text.replace(f"10.76.0.{k}:14600", f"127.0.0.1:{next(ports)}")
         text = text.replace("serial:/dev/ttyAMA0:921600", f"udp:127.0.0.1:{next(ports)}", 1)
     fleet.write_text(text)
-    monkeypatch.setattr(check, "_bus", lambda: check.Finding("bus", "a route"))
+    monkeypatch.setattr(check, "check_route", lambda on_drone: Finding("multicast", "a route"))
     return fleet
 
 

@@ -12,12 +12,11 @@ from tools.errors import MISSING, plain_errors
 
 if TYPE_CHECKING:
     from procs.settings import Mission
-    from tools.fleet.check import Finding
+    from tools.findings import Finding
 
 __all__ = ["doctor"]
 
 CHECKS = ("multicast", "rmem_max", "slots", "shm", "model", "java")
-SLOTS_OF_A_RING = 16  # frames that drivers.frames keeps
 
 
 def doctor(
@@ -82,12 +81,11 @@ def _look(
     on_drone = drone_id is not None
     asked = mission or Mission()
     n_cameras = 1 if on_drone else len(asked.drones)
-    frame_bytes = asked.camera.width_px * asked.camera.height_px * 3
     checks: dict[str, Callable[[], Finding]] = {
         "multicast": lambda: machine.check_route(on_drone=on_drone),
         "rmem_max": machine.check_receive_buffer,
         "slots": machine.check_slots,
-        "shm": lambda: machine.check_shared_memory(n_cameras * SLOTS_OF_A_RING * frame_bytes),
+        "shm": lambda: machine.check_shared_memory(machine.frames_bytes(asked.camera, n_cameras)),
         "model": machine.check_model,
         "java": machine.check_java,
     }

@@ -7,8 +7,10 @@ import time
 from pathlib import Path
 
 from drivers.autopilots.mavlink_link import AutopilotLink, open_link
+from drivers.frames import SHARED_FOLDER
 from procs.settings import Mission
-from tools.fleet.check import Finding, check_drone, check_fleet
+from tools.findings import Finding
+from tools.fleet.check import check_drone, check_fleet
 from tools.fleet.machine import machine_of
 
 __all__ = ["check_autopilot", "fleet_findings"]
@@ -16,7 +18,7 @@ __all__ = ["check_autopilot", "fleet_findings"]
 LISTEN_S = 3.0  # an autopilot beats once a second
 MAVLINK_STARTS = (0xFE, 0xFD)  # MAVLink 1 and 2
 HEARTBEAT_BYTES = 17  # the shortest frame that holds one
-OWN = ("bus", "frames")  # checked by doctor itself, more closely
+OWN = ("multicast", "rmem_max", str(SHARED_FOLDER))  # of the machine: doctor looks at them in any case
 
 
 def fleet_findings(mission: Mission, path: Path, drone_id: int | None) -> list[Finding]:

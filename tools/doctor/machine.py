@@ -12,10 +12,12 @@ import psutil
 
 import models
 from drivers.frames import SHARED_FOLDER
+from procs.bus_executor import ROUTE_COMMAND
 from procs.detector.decode import ModelError
+from procs.settings import CameraSettings
 from tools.buses import FIRST_PORT, N_SLOTS, has_multicast_route, taken_slots
 from tools.doctor.mend import as_root
-from tools.fleet.check import Finding
+from tools.findings import Finding
 from tools.spy.gui import what_is_missing
 
 __all__ = [
@@ -26,12 +28,14 @@ __all__ = [
     "check_route",
     "check_shared_memory",
     "check_slots",
+    "frames_bytes",
 ]
 
 RECEIVE_BYTES = 4194304  # every bus asks for it: with less, long messages are lost (docs/architecture.md)
 GROUP = "239.255.76.100"  # no drone's: ids begin at 1
 HEAR_S = 0.5
 LOOPBACK = "127."
+SLOTS_OF_A_RING = 16  # frames that drivers.frames keeps
 SHIPPED = "detector.onnx"
 
 
@@ -39,7 +43,7 @@ def check_route(*, on_drone: bool = False) -> Finding:
     """Whether a message to a drone's group leaves and is heard again; on a drone, over the loopback alone."""
     what = "multicast"
     up = f"{as_root('ip link set lo up')} && " if not _is_loopback_up() else ""
-    mend = up + as_root("ip route replace 239.255.76.0/24 dev lo")
+    mend = up + as_root(ROUTE_COMMAND)
     if not has_multicast_route():
         return Finding(what, lacks="no multicast route: there can be no bus", mend=mend)
     source = _source_address()
@@ -93,6 +97,11 @@ def check_slots(
                 mend=mend,
             )
     return Finding("slots", f"{in_use}; slot {free[0]} and its udp port {port} are free")
+
+
+def frames_bytes(camera: CameraSettings, n_cameras: int) -> int:
+    """What the rings of frames of so many cameras take."""
+    return n_cameras * SLOTS_OF_A_RING * camera.width_px * camera.height_px * 3
 
 
 def check_shared_memory(wanted_bytes: int, folder: Path = SHARED_FOLDER) -> Finding:

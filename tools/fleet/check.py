@@ -3,29 +3,17 @@
 import os
 import socket
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 from procs.bus_executor import load_driver
 from procs.relay.keys import FleetKeyError, read_key
 from procs.runtime import RuntimeFailure
 from procs.settings import DriverSpec, MachineSettings, Mission
-from tools.buses import FIRST_PORT, has_multicast_route
+from tools.doctor.machine import check_receive_buffer, check_route, check_shared_memory, frames_bytes
+from tools.findings import Finding
 from tools.fleet.machine import drone_settings, listen_address, machine_of
 
-__all__ = ["Finding", "check_drone", "check_fleet"]
-
-GROUP = "239.255.76.100"
-
-
-@dataclass(frozen=True)
-class Finding:
-    """One thing that was looked at; `lacks` and `mend` are empty where it is well."""
-
-    what: str
-    found: str = ""
-    lacks: str = ""
-    mend: str = ""
+__all__ = ["check_drone", "check_fleet"]
 
 
 def check_fleet(mission: Mission, path: Path) -> list[Finding]:
@@ -49,8 +37,9 @@ def check_drone(mission: Mission, path: Path, drone_id: int) -> list[Finding]:
         _camera(mission, machine, settings.drivers["camera"]),
         _device("autopilot", machine.autopilot),
         _port("radio", listen_address(machine.radio)),
-        _bus(),
-        _shared_memory(),
+        check_route(on_drone=True),
+        check_receive_buffer(),
+        check_shared_memory(frames_bytes(mission.camera, 1)),
     ]
 
 
@@ -175,28 +164,3 @@ def _port(what: str, address: str) -> Finding:
                 what, lacks=f"udp {address}: {error}", mend=f"ss -lunp sport = :{port}; end that program"
             )
     return Finding(what, f"udp {address} is free")
-
-
-def _bus() -> Finding:
-    """A route for the drone's multicast group, over the loopback so that the bus stays on the drone."""
-    mend = "sudo ip route replace 239.255.76.0/24 dev lo"
-    if not has_multicast_route():
-        return Finding("bus", lacks="no multicast route", mend=mend)
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.connect((GROUP, FIRST_PORT))
-        source = probe.getsockname()[0]
-    if not source.startswith("127."):
-        return Finding(
-            "bus",
-            lacks=f"the bus hangs on the interface of {source}: when that goes down, it dies",
-            mend=mend,
-        )
-    return Finding("bus", "multicast over the loopback")
-
-
-def _shared_memory(folder: Path = Path("/dev/shm")) -> Finding:
-    if not os.access(folder, os.W_OK):
-        return Finding(
-            "frames", lacks=f"{folder} cannot be written", mend=f"sudo mount -t tmpfs tmpfs {folder}"
-        )
-    return Finding("frames", f"{folder} can be written")

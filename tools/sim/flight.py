@@ -10,6 +10,7 @@ from rich.markup import escape
 
 import fleets
 from drivers.sim.render import open_surface
+from procs.bus_executor import ROUTE_COMMAND
 from procs.runtime import RuntimeFailure
 from procs.settings import DroneEntry, MissionError, beside, load_mission, validate
 from tools.buses import has_multicast_route
@@ -28,7 +29,7 @@ HOME_SPACING_M = 10.0  # two drones that land beside each other are each 1.5 m o
 SENSORS = ("pixels", "boxes")
 SIMULATED = "sim"
 LINKS = ("udp", "udpout", "tcp", "serial")
-NO_ROUTE = "no multicast route; for real buses: ip route add 224.0.0.0/4 dev lo"
+NO_ROUTE = f"no multicast route; for real buses: {ROUTE_COMMAND}"
 
 
 def command(
@@ -56,7 +57,7 @@ def command(
         addresses = _addresses(autopilot, chosen, lockstep, fallback)
         plan = _plan(chosen, out, sensor, scene, addresses)
     if fallback:
-        console.print(f"Flying in lockstep: {fallback}", highlight=False)
+        console.print(f"Flying in lockstep: {fallback}", highlight=False, soft_wrap=True)
     console.print(
         f"[bold]{escape(chosen.name)}[/]: {_counted(len(chosen.drones), 'drone')}, "
         f"{_counted(chosen.pod.animals, 'animal')}, seed {chosen.seed} -> {plan.folder}",
