@@ -271,6 +271,17 @@ def test_a_death_ends_a_drones_way_on_the_map(tmp_path: Path) -> None:
     assert np.isnan(way[21:]).all()
 
 
+def test_a_run_in_which_a_drone_died_says_so_and_claims_no_more(tmp_path: Path) -> None:
+    folder = MappedRun(deaths={2: 20.0}).write(tmp_path / "run")
+    log = folder / "drone_2.mcap"
+    log.write_bytes(log.read_bytes()[:-200])  # killed: its summary was never written
+    flight = read_flight([folder])
+    assert any("was not closed" in problem for problem in flight.run.problems)
+    section = make_section("m0", flight)
+    assert section.sentence.startswith("Each drone kept an animal of its own in view for as long as it flew")
+    assert [finding.text for finding in section.wrong] == ["Drone 2 failed at 0:20 and was not heard again."]
+
+
 def test_logs_alone_make_a_report_that_says_whose_word_it_is(alone: Path) -> None:
     flight = read_flight([alone])
     assert not flight.knows_drones

@@ -87,7 +87,9 @@ class LineChart {
     const bin = Math.floor(t / this.chart.bin);
     for (const { curve, words } of this.items) {
       const value = curve.values[Math.min(bin, curve.values.length - 1)];
-      words.textContent = value === null ? `${curve.name}: –` : `${curve.name}: ${Number(value.toPrecision(3))}`;
+      const unit = this.chart.unit.length < 3 ? ` ${this.chart.unit}` : "";
+      const shown = value === null ? "–" : `${value < 10 ? Number(value.toPrecision(2)) : Math.round(value)}${unit}`;
+      words.textContent = `${curve.name}: ${shown}`;
     }
   }
 }

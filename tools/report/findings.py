@@ -55,7 +55,10 @@ class Finding:
 def sentence(flight: Flight, watched: dict[int, list[Span]]) -> tuple[bool | None, str]:
     """(whether it went well, None where nobody can know; the mission in one sentence)."""
     if flight.knows_animals:
-        return headline(flight.summary)
+        is_good, words = headline(flight.summary)
+        if is_good and flight.run.truth.deaths:
+            words = words.replace(" in view", " in view for as long as it flew")
+        return is_good, words
     n_watched = sum(1 for log in flight.run.drones if monitor_spans(log))
     if not n_watched:
         return False, "No drone came to watch an animal."
@@ -234,8 +237,11 @@ def _troubles(flight: Flight) -> Iterator[Finding]:
 
 
 def _notes(flight: Flight) -> Iterator[Finding]:
-    if flight.run.problems:
-        n_parts = len(flight.run.problems)
+    # That the log of a drone that died was never closed is no news.
+    died = tuple(f"drone {drone_id}: " for drone_id in flight.run.truth.deaths)
+    unread = [p for p in flight.run.problems if not (p.startswith(died) and "was not closed" in p)]
+    if unread:
+        n_parts = len(unread)
         places = f"{n_parts} place{'' if n_parts == 1 else 's'}"
         text = (
             f"Not everything could be read ({places}), so something may be missing here; see “What could not "

@@ -3,6 +3,7 @@
 
 const SVG = "http://www.w3.org/2000/svg";
 const TAIL_S = 30;
+const AHEAD_S = 5; // an animal lies along its way from so long ago to so long after
 const LEAST_SPAN_M = 15;
 
 function make(parent, name, attributes) {
@@ -205,16 +206,17 @@ class FleetMap {
 
   showAnimal(animal, place, t) {
     const [x, y] = this.toPx(place);
-    const before = placeAt(animal, step(this), Math.max(t - 4, 0)) || place;
-    const after = placeAt(animal, step(this), Math.min(t + 4, this.data.end)) || place;
+    const before = placeAt(animal, step(this), Math.max(t - AHEAD_S, 0)) || place;
+    const after = placeAt(animal, step(this), Math.min(t + AHEAD_S, this.data.end)) || place;
     const way = [after[0] - before[0], after[1] - before[1]];
     const swims = Math.hypot(...way) > 1;
+    const turn = (-Math.atan2(way[1], way[0]) * 180) / Math.PI;
     const half = Math.max((animal.length * this.scale) / 2, 5);
     const isRoomy = half * (swims ? 0.56 : 1) > 16;
     set(animal.group, { transform: `translate(${x.toFixed(1)} ${y.toFixed(1)})` });
     set(animal.body, {
       rx: half, ry: half * (swims ? 0.28 : 1), "fill-opacity": swims ? 1 : 0.5,
-      transform: `rotate(${((-Math.atan2(way[1], way[0]) * 180) / Math.PI).toFixed(0)})`,
+      transform: `rotate(${turn.toFixed(0)})`,
     });
     set(animal.number, { class: isRoomy ? "animal-number" : "outside", y: isRoomy ? 0 : -Math.min(half, 14) - 7 });
   }
@@ -225,7 +227,7 @@ class FleetMap {
     for (const part of [drone.group, drone.tail, drone.view, drone.watch]) part.style.display = isThere ? "" : "none";
     if (!isThere) return;
     const [x, y] = this.toPx(place);
-    const yaw = nearestYaw(drone.yaw, step(this), t);
+    const yaw = drone.yaw[nearest(drone.yaw, step(this), t)] || 0;
     set(drone.group, { transform: `translate(${x.toFixed(1)} ${y.toFixed(1)})` });
     set(drone.nose, { transform: `rotate(${yaw.toFixed(0)})` });
     set(drone.tail, { d: this.path(drone, Math.max(t - TAIL_S, 0), t) });
@@ -294,7 +296,7 @@ class FleetMap {
 
 const step = (map) => map.data.step;
 
-// Headings are not mixed: between two samples the nearer one holds.
-function nearestYaw(yaws, step, t) {
-  return yaws[Math.min(Math.max(Math.round(t / step), 0), yaws.length - 1)] || 0;
+// Directions are not mixed: between two samples the nearer one holds.
+function nearest(values, step, t) {
+  return Math.min(Math.max(Math.round(t / step), 0), values.length - 1);
 }

@@ -149,4 +149,10 @@ document.querySelectorAll(".look").forEach((button) => {
     mission.section.querySelector(".stage").scrollIntoView({ block: "center", behavior: "smooth" });
   });
 });
+let unfolded = [];
+addEventListener("beforeprint", () => {
+  unfolded = [...document.querySelectorAll("details:not([open])")];
+  unfolded.forEach((one) => (one.open = true));
+});
+addEventListener("afterprint", () => unfolded.forEach((one) => (one.open = false)));
 addEventListener("resize", () => missions.forEach((mission) => mission.show(mission.t)));

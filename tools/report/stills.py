@@ -22,6 +22,7 @@ SIGHT_S = 0.3  # boxes and tracks this near in time to a picture are drawn on it
 LOOKED_AT = 8  # of the likeliest pictures of an animal are decoded
 LEAST_CONTRAST = 1.0  # grey levels; a picture with less is black, or empty
 ODD = 1.3  # times an animal's usual size: a box round two
+LARGE = 0.06  # of a picture; a larger box is not better
 ROUND_ABOUT = 1.7  # times its box is cut out round an animal
 LEAST_CUT = 0.45  # of the picture's width; less would only show pixels
 JPEG_START = b"\xff\xd8"
@@ -155,7 +156,7 @@ class _Nearest:
 
 def _size_and_place(still: Still, mark: Mark) -> float:
     """The box's share of the picture; less at its edge or far from its middle, more where it is tracked."""
-    size = min(mark.width * mark.height / (still.width * still.height), 0.25) / 0.25
+    size = min(mark.width * mark.height / (still.width * still.height), LARGE) / LARGE
     u, v = mark.x + mark.width / 2, mark.y + mark.height / 2
     off = np.hypot(u / still.width - 0.5, v / still.height - 0.5)
     is_whole = mark.x > 1 and mark.y > 1

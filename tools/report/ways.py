@@ -23,8 +23,8 @@ OLDEST_SIGHT_S = 10.0  # an animal that no drone saw for so long is nowhere
 class Ways:
     """(T,) instants `step_s` apart from 0; NaN where nobody knows a place.
 
-    drones: id -> (T, 4) north, east, height in m, yaw in rad; animals: number -> (T, 3) north, east, depth in
-    m; lengths_m: number -> body length.
+    drones: id -> (T, 4) north, east, height in m, yaw in rad; animals: number -> (T, 2) north, east in m;
+    lengths_m: number -> body length.
     """
 
     step_s: float
@@ -42,7 +42,7 @@ def find_ways(flight: Flight) -> Ways:
     if flight.knows_animals:
         truth = flight.run.truth
         places = truth.animals_at(t_s)
-        animals = {animal: places[:, k][:, [0, 1, 3]] for k, animal in enumerate(truth.animal_ids)}
+        animals = {animal: places[:, k, :2] for k, animal in enumerate(truth.animal_ids)}
         lengths = {animal: float(np.nanmedian(rows[:, 2])) for animal, rows in truth.animals.items()}
     else:
         animals, lengths = _believed_animals(flight, t_s)
@@ -77,7 +77,7 @@ def _believed_drones(flight: Flight, t_s: Array) -> dict[int, Array]:
 
 def _believed_animals(flight: Flight, t_s: Array) -> tuple[dict[int, Array], dict[int, float]]:
     """The fleet's map: of each animal in each second the freshest sight, of equals the nearest to the map."""
-    best: dict[int, dict[int, tuple[tuple[float, float], tuple[float, float, float]]]] = {}
+    best: dict[int, dict[int, tuple[tuple[float, float], tuple[float, ...]]]] = {}
     sizes: dict[int, list[float]] = {}
     for log in flight.run.drones:
         for at_s, named in flight.run.messages[log.id][channels.IDENTITIES]:
@@ -92,8 +92,7 @@ def _believed_animals(flight: Flight, t_s: Array) -> tuple[dict[int, Array], dic
     ways = {}
     for animal, slots in sorted(best.items()):
         known = np.array([slots[second][1] for second in sorted(slots)])
-        places = _resampled(t_s, known[:, 0], known[:, 1:])
-        ways[animal] = np.column_stack([places, np.zeros(len(t_s))])
+        ways[animal] = _resampled(t_s, known[:, 0], known[:, 1:])
     return ways, {animal: float(np.median(sizes[animal])) for animal in ways}
 
 
