@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from tests.bus.chromium import Page, chromium, find_chromium
-from tests.unit.test_report import HOSTILE, MappedRun, logs_only
+from tests.unit.report_runs import HOSTILE, MappedRun, logs_only
 from tools.report import make_report
 from tools.report.flights import read_flight
 from tools.report.page import SCRIPTS, write_report
