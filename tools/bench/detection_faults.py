@@ -38,8 +38,8 @@ def _part(picture: Image, rows: slice, columns: slice, *bgr: int) -> Image:
     return changed
 
 
-def _noisy(picture: Image, noise: NDArray[Any]) -> Image:
-    return np.clip(picture.astype(np.float64) + noise, 0, 255).astype(np.uint8)
+def _noisy(picture: Image, noise: NDArray[Any] | float) -> Image:
+    return np.asarray(np.clip(picture.astype(np.float64) + noise, 0, 255), np.uint8)
 
 
 def _salted(picture: Image, random: Random) -> Image:
@@ -151,7 +151,7 @@ PICTURES: tuple[tuple[str, str, OfPicture], ...] = (
     ("inverted", "", lambda p, _r: 255 - p),
     ("bits shifted", "", lambda p, _r: p << 3),
     ("two levels", "", lambda p, _r: (p > 80).astype(np.uint8) * 255),
-    ("overexposed", "", lambda p, _r: _noisy(p, np.float64(150))),
+    ("overexposed", "", lambda p, _r: _noisy(p, 150.0)),
     ("blurred", "", lambda p, _r: cv2.GaussianBlur(p, (0, 0), 25)),
     ("JPEG of quality 1", "", lambda p, _r: _jpeg(p)),
     ("sixteen times coarser", "", lambda p, _r: _coarse(p)),
