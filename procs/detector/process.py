@@ -2,10 +2,10 @@
 
 Hears FRAME, and VEHICLE_STATE to know how large an animal should look. Says DETECTIONS at most at
 camera.detect_hz, with the frame's instant of capture; a frame without animals gives a message without boxes.
-A frame that is gone from the ring is skipped and counted. When FRAME dies, or its pictures stay the same to
-the last bit for a second, it falls silent: presence fades and nobody acts on old boxes. A model that is
-missing or broken ends the process with exit code 3 and the remedy. On SIGHUP it reads its settings and the
-model again; a new model that cannot be used leaves the old one at work, and the heartbeat says so.
+A frame that is gone from the ring is skipped and counted. When FRAME dies, or in the air its pictures stay
+the same to the last bit for a second, it falls silent: presence fades and nobody acts on old boxes. A model
+that is missing or broken ends the process with exit code 3 and the remedy. On SIGHUP it reads its settings
+and the model again; a new model that cannot be used leaves the old one at work, and the heartbeat says so.
 """
 
 from typing import Any
@@ -35,6 +35,7 @@ class DetectorShell:
             raise RuntimeFailure(str(error)) from error
         self._last_utime = 0
         self._changed_utime = 0  # capture of the newest frame that was unlike the one before it
+        self._is_landed = False
         self._height_m = 0.0
         self._height_utime = 0
 
@@ -74,7 +75,8 @@ class DetectorShell:
         )
 
     def on_vehicle_state(self, state: vehicle_state_t) -> None:
-        """How high the camera is."""
+        """How high the camera is, and whether it moves at all."""
+        self._is_landed = state.landed
         if state.position_ok:
             self._height_m, self._height_utime = -state.d_m, state.utime
 
@@ -115,7 +117,9 @@ class DetectorShell:
             self._runtime.degraded(trouble, cause="picture")
         else:
             self._runtime.ok("picture")
-        if not getattr(found, "n_repeats", 0) or frame.utime < self._changed_utime:
+        # On the ground a view may lie still, and nothing follows what is seen there.
+        is_same = getattr(found, "n_repeats", 0) > 0 and not self._is_landed
+        if not is_same or frame.utime < self._changed_utime:
             self._changed_utime = frame.utime
         frozen_s = (frame.utime - self._changed_utime) / 1e6
         if frozen_s < FROZEN_AFTER_S:

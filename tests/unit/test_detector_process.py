@@ -91,6 +91,17 @@ def test_a_camera_that_hangs_for_a_second_gets_no_answer() -> None:
     assert drone.beat.status == heartbeat_t.OK
 
 
+def test_on_the_ground_a_view_may_lie_still() -> None:
+    detector = Recorder()
+    drone = bench(detector)
+    drone.run(1.0)
+    drone.say(channels.VEHICLE_STATE, make(vehicle_state_t, position_ok=True, landed=True))
+    for number in range(10):
+        detector.n_repeats = number
+        show(drone, number)
+    assert drone.count(channels.DETECTIONS) == 10
+
+
 def test_what_is_wrong_with_a_picture_goes_to_the_heartbeat(tmp_path: Path) -> None:
     detector = Detector(network(tmp_path / "raw.onnx", raw((32, 32, 10, 10, 0.9))))
     drone = bench(detector)
