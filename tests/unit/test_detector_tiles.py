@@ -81,6 +81,7 @@ def test_one_animal_seen_twice_is_one_and_two_side_by_side_stay_two() -> None:
     pair = candidates((10, 10, 50, 50), (20, 20, 60, 60))
     again = candidates((12, 11, 51, 50), (21, 19, 62, 61), (100, 100, 120, 120))
     assert merge([pair, again]).boxes[:, 0].tolist() == [10, 20, 100]
+    assert len(merge([candidates((10, 10, 50, 50)), pair]).boxes) == 2, "one known, one new beside it"
     calf = candidates((30, 30, 44, 44))  # within its mother's box
     assert len(merge([pair, calf]).boxes) == 3
 
