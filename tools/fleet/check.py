@@ -92,7 +92,7 @@ def _model(spec: DriverSpec) -> Finding:
         load_driver(spec)
     except RuntimeFailure as error:
         return Finding("model", lacks=str(error), mend="pip install --force-reinstall podwatch")
-    return Finding("model", str(spec.options.get("model_path", "the detector that ships")))
+    return Finding("model", str(spec.options.get("model_path") or "the detector that ships"))
 
 
 def _camera(mission: Mission, machine: MachineSettings, spec: DriverSpec) -> Finding:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 
+from lcmtypes import channels
+
 __all__ = [
     "KIND_WORDS",
     "PROCESS_WORDS",
@@ -46,9 +48,9 @@ PROCESS_WORDS = {
     "logger": "recording",
 }
 KIND_WORDS = {
-    "RING_EPISODE": "calls to compare views",
-    "RING_MAP": "where the animals are",
-    "RING_ASSIGN": "who takes which animal",
+    channels.RING_EPISODE: "calls to compare views",
+    channels.RING_MAP: "where the animals are",
+    channels.RING_ASSIGN: "who takes which animal",
     "link": "being there: places, states, clocks",
 }
 # The judge's own words -> words for people; in this order.
