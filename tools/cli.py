@@ -80,15 +80,23 @@ def train_detector(
     data: Annotated[
         Path | None, typer.Option(help="A data.yaml in the YOLO layout to train on as well.")
     ] = None,
+    begin_from: Annotated[
+        Path | None,
+        typer.Option("--from", help="Begin with these weights: a detector.onnx or checkpoint.pt."),
+    ] = None,
+    width: Annotated[float, typer.Option(help="Of the network: channels times this.")] = 1.0,
     steps: Annotated[int | None, typer.Option(min=1)] = None,
+    minutes: Annotated[float | None, typer.Option(min=0.1, help="As many steps as fit.")] = None,
     seed: Annotated[int, typer.Option(min=0)] = 0,
+    threads: Annotated[int, typer.Option(min=1, help="More than one: for an idle machine.")] = 1,
+    int8: Annotated[bool, typer.Option("--int8", help="Export in 8 bits as well.")] = False,
     smoke: Annotated[bool, typer.Option("--smoke", help="A few steps, export and check only.")] = False,
 ) -> None:
     """Train the detector and export it to ONNX."""
     with wanted_extra("train"):
-        from tools.train.detector.training import Settings, command
+        from tools.train.detector.training import command, settings_of
     with plain_errors():
-        command(out, data, Settings.steps if steps is None else steps, seed, smoke)
+        command(out, settings_of(width, steps, minutes, seed, threads), data, begin_from, smoke, int8)
 
 
 @train.command("assigner")

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from drivers.cameras.pinhole import Pinhole, Pose
 from drivers.sim.render import AnimalView, SeaRenderer
 from tools.cli import app
-from tools.train.detector.training import real_data
+from tools.train.detector.samples import real_data
 
 RIGHT_WHALES = real_data() / "right_whales"
 HELD_OUT = "w_10"  # every fifth picture is kept from training

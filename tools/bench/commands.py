@@ -29,14 +29,16 @@ def bench_fleet(
 
 @bench.command("detection")
 def bench_detection(
-    scenes: Annotated[int, typer.Option(min=1, help="Rendered scenes a set.")] = 300,
-    seed: Annotated[int, typer.Option(min=0)] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Of the rendered scenes.")] = 1,
+    out: Annotated[Path, typer.Option(help="Folder for the table and the figures.")] = Path("runs/bench"),
+    model: Annotated[Path | None, typer.Option(help="Another ONNX file than the one that ships.")] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="Few scenes a set.")] = False,
 ) -> None:
-    """Recall, precision and AP50 on held-out photographs and rendered scenes."""
-    with wanted_extra("train"):
-        from tools.train.detector.training import evaluate
+    """Recall, precision, counts, false alarms and time on rendered scenes and held-out photographs."""
+    from tools.bench.detection import command
+
     with plain_errors():
-        evaluate(scenes=scenes, seed=seed)
+        command(seed, out, quick=quick, model=model)
 
 
 @bench.command("registration")

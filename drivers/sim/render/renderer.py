@@ -19,7 +19,7 @@ from drivers.sim.render.species import Species, species_named
 from drivers.sim.render.sprites import PHASES, Sprite, make_foam, make_poster, make_sprite
 from drivers.sim.render.textures import VIEW_PX, Layer, colour_table, grass_layers, sea_layers
 
-__all__ = ["WATERS", "SeaRenderer"]
+__all__ = ["MORE_WATERS", "WATERS", "SeaRenderer"]
 
 Array = NDArray[np.float64]
 
@@ -37,6 +37,17 @@ WATERS: dict[str, tuple[int, int, int]] = {
     "slate": (118, 112, 102),
     "green": (72, 72, 36),
     "dark": (52, 50, 42),
+}
+# For training and validation alone: no seed of a simulated sea draws them.
+MORE_WATERS: dict[str, tuple[int, int, int]] = {
+    "murky": (70, 98, 96),
+    "milky": (150, 146, 112),
+    "silver": (160, 156, 150),
+    "violet": (96, 56, 46),
+    "lagoon": (150, 142, 66),
+    "pewter": (134, 124, 110),
+    "bottle": (66, 82, 30),
+    "ink": (62, 40, 22),
 }
 GRASS_BGR = ((38, 88, 62), (52, 118, 84), (74, 146, 112), (96, 160, 150))
 
@@ -70,8 +81,8 @@ class SeaRenderer:
             raise ValueError(
                 f"sea_state {sea_state}: must lie between 0 (glass) and 5 (whitecaps everywhere)"
             )
-        if water is not None and water not in WATERS:
-            raise ValueError(f"water {water!r} is not known; there are: {', '.join(WATERS)}")
+        if water is not None and water not in {**WATERS, **MORE_WATERS}:
+            raise ValueError(f"water {water!r} is not known; there are: {', '.join([*WATERS, *MORE_WATERS])}")
         self._seed, self._kind = seed, kind
         self._shapes = dict(shapes or {})
         known = [self._species(name) for name in species]
@@ -116,13 +127,17 @@ class SeaRenderer:
             cv2.add(brightness, self._glint_image(camera, to_ground, pose), dst=brightness)
         image = np.asarray(cv2.applyColorMap(brightness, self._table), np.uint8)
         _paint_sky(image, to_ground)
-        to_image = camera.ground_to_image(pose)
-        for animal in sorted(animals, key=lambda item: (-item.depth_m, item.id)):  # the deepest first
-            self._draw(image, to_image, animal)
+        self.draw(image, camera, pose, animals)
         if out is None:
             return image
         out[:] = image
         return out
+
+    def draw(self, image: Image, camera: Pinhole, pose: Pose, animals: Sequence[AnimalView]) -> None:
+        """Draw the animals alone into a view of (H, W, 3) uint8 BGR, in place, the deepest first."""
+        to_image = camera.ground_to_image(pose)
+        for animal in sorted(animals, key=lambda item: (-item.depth_m, item.id)):
+            self._draw(image, to_image, animal)
 
     def labels(self, camera: Pinhole, pose: Pose, animals: Sequence[AnimalView]) -> Labels:
         """Where each animal lies in the view that `render` makes; see `label_animals`."""
@@ -220,7 +235,9 @@ def _cached_sprite(seed: int, species: Species, individual: int, picture: int) -
 def _sea_table(seed: int, water: str | None) -> Image:
     rng = np.random.default_rng([seed, 3])
     name = water if water is not None else list(WATERS)[int(rng.integers(len(WATERS)))]
-    middle = np.asarray(WATERS[name], float) * rng.uniform(0.9, 1.1, 3) * rng.uniform(0.9, 1.1)
+    middle = (
+        np.asarray({**WATERS, **MORE_WATERS}[name], float) * rng.uniform(0.9, 1.1, 3) * rng.uniform(0.9, 1.1)
+    )
     light = middle * 1.25 + rng.uniform(18, 34)
     return colour_table(middle * 0.5, middle, light, np.array([236.0, 234.0, 228.0]))
 

@@ -130,6 +130,13 @@ def _skin(species: Species, rng: np.random.Generator, bend: float) -> FloatImage
     return np.asarray(skin + light_share * (np.asarray(species.patch_bgr, np.float32) - skin), np.float32)
 
 
+def _above_water(species: Species, station: FloatImage) -> FloatImage:
+    """Share of the opacity left where head or tail hang in the water, 0 to 1."""
+    sunk = species.head_under * np.clip(1 - station / 0.45, 0, 1)
+    sunk += species.tail_under * np.clip((station - 0.35) / 0.4, 0, 1)
+    return np.asarray(np.clip(1 - sunk, 0, 1), np.float32)
+
+
 def make_sprite(species: Species, rng: np.random.Generator, phase: int) -> Sprite:
     """The animal seen from above, just awash: opaque along the back, fading where it lies deeper."""
     bend, chord_share = stroke_of(phase)
@@ -147,6 +154,8 @@ def make_sprite(species: Species, rng: np.random.Generator, phase: int) -> Sprit
         skin *= (1 - 0.6 * np.clip(fin_shape * 25 * species.dorsal_height, 0, 1))[..., None].astype(
             np.float32
         )
+    if species.head_under > 0 or species.tail_under > 0:
+        opacity = opacity * _above_water(species, station)
     opacity = cv2.GaussianBlur(opacity.astype(np.float32), (0, 0), 0.8)
     return _sprite_of(skin.astype(np.float32), np.asarray(opacity, np.float32))
 
@@ -170,6 +179,8 @@ def make_foam(species: Species, rng: np.random.Generator) -> Sprite:
     foam = (
         np.clip(edge * 1.1 + wake * 0.55 + 0.25 * body * (_noise(rng, 40, 12) > 1.3), 0, 1) * lace * patches
     )
+    if species.head_under > 0 or species.tail_under > 0:
+        foam = foam * _above_water(species, station)  # what hangs in the water breaks no surface
     opacity = cv2.GaussianBlur((foam * 0.92).astype(np.float32), (0, 0), 0.7)
     return _sprite_of(np.full((*opacity.shape, 3), 240, np.float32), np.asarray(opacity, np.float32))
 

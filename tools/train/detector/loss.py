@@ -37,7 +37,7 @@ def assign(
     own boxes fit it best answer for it (task-aligned assignment, Feng et al. 2021); the best of them should
     say its own IoU.
     """
-    owner = torch.full(scores.shape, -1, dtype=torch.long)
+    owner = torch.full(scores.shape, -1, dtype=torch.long, device=scores.device)
     target = torch.zeros_like(scores)
     if len(animals) == 0:
         return owner, target

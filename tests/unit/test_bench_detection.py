@@ -1,0 +1,117 @@
+"""The detection benchmark in small: its figures by hand, and a floor under the model that ships."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from procs.detector.yolo import Detections
+from tools.bench import detection
+from tools.bench.detection import Measures, available, command
+from tools.bench.detection_figures import cells
+from tools.bench.detection_measure import Animal, Tally, held_out_photographs, look, open_detector, rendered
+from tools.bench.table import Row
+from tools.train.detector.samples import real_data
+
+
+def animal(score: float, long_px: float) -> Animal:
+    return Animal(score, long_px, 0.0, 50.0, 0.0, 1.0, on_grass=False)
+
+
+def tally(*scenes: tuple[int, list[tuple[float, bool]]]) -> Tally:
+    made = Tally()
+    for count, results in scenes:
+        made.results += results
+        made.boxes_a_picture.append(np.array([score for score, _ in results]))
+        made.animals_a_picture.append(count)
+    return made
+
+
+def test_found_false_and_missed_are_counted_at_a_confidence() -> None:
+    made = tally((2, [(0.9, True), (0.3, False)]), (1, [(0.2, True)]), (0, []))
+    assert made.counts(0.25) == (1, 1, 2)
+    assert made.counts(0.1) == (2, 1, 1)
+    assert made.exact_share(0.25) == pytest.approx(2 / 3)  # two boxes for two animals, none for none
+    assert made.exact_share(0.5) == pytest.approx(1 / 3)
+    assert Tally().exact_share() == 0.0
+
+
+def test_animals_fall_into_the_cell_between_two_edges() -> None:
+    animals = [animal(0.9, 12), animal(0.1, 15.9), animal(0.3, 16), animal(0.9, 500)]
+    assert cells(animals, lambda item: item.long_px, (12, 16, 24)) == [(1, 2), (2, 2)]
+
+
+def test_a_box_on_a_faint_animal_is_no_false_alarm_but_is_told() -> None:
+    scene = next(item for item in rendered(40, 3, "val") if len(item.faint) and len(item.boxes))
+
+    class Oracle:
+        input_size = (320, 320)
+
+        def detect(self, image: np.ndarray) -> Detections:
+            boxes = np.concatenate([scene.boxes, scene.faint])
+            return Detections(
+                boxes, np.ones(len(boxes), np.float32), np.zeros(len(boxes), np.int64), {0: "whale"}
+            )
+
+    made = look({"oracle": Oracle()}, [scene])["oracle"]  # type: ignore[dict-item]
+    assert made.counts() == (len(scene.boxes), 0, 0)
+    assert made.faint_found == made.faint == len(scene.faint)
+    assert all(item.score == 1 for item in made.animals)
+
+
+@pytest.mark.timeout(240)
+def test_the_table_has_every_row_in_order_and_says_what_is_missing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PODWATCH_REAL_DATA", str(tmp_path / "nowhere"))
+    monkeypatch.setattr(detection, "QUICK", 2)
+    slow = [Row("ms an image", 1, "-", "5 ms"), Row("corruptions of the input survived", 1, "-", "1 of 1")]
+    monkeypatch.setattr(detection, "_time_rows", lambda m: iter(slow[:1]))
+    monkeypatch.setattr(detection, "_corruption_rows", lambda m: iter(slow[1:]))
+    command(1, tmp_path, quick=True)
+    rows = json.loads((tmp_path / "bench_detection.json").read_text())
+    names = [row["name"] for row in rows]
+    order = (
+        "recall",
+        "precision",
+        "Table 1, ours",
+        "exact count of 5",
+        "photographs",
+        "false alarms",
+        "ms an",
+    )
+    places = [next(k for k, name in enumerate(names) if word in name) for word in order]
+    assert places == sorted(places)
+    photographs = next(row for row in rows if "photographs" in row["name"])
+    assert photographs["figure"] is None
+    assert "PODWATCH_REAL_DATA" in photographs["why"]
+    assert (tmp_path / "detection_recall.png").stat().st_size > 10_000
+    assert (tmp_path / "detection_counts.png").is_file()
+
+
+@pytest.fixture(scope="module")
+def ours() -> Tally:
+    """The model that ships on 40 validation scenes."""
+    detectors = Measures(1, quick=True, paths=available()).ours
+    return look(detectors, rendered(40, 77, "val"))["ours"]
+
+
+def test_the_model_that_ships_finds_animals_of_species_that_it_never_learnt(ours: Tally) -> None:
+    found, false, missed = ours.counts()
+    assert found / (found + missed) > 0.55
+    assert found / (found + false) > 0.55
+    assert ours.average_precision() > 0.6
+
+
+def test_the_model_that_ships_is_quiet_over_empty_seas() -> None:
+    detectors = Measures(1, quick=True, paths=available()).ours
+    _, false, _ = look(detectors, rendered(30, 77, "empty"))["ours"].counts()
+    assert false / 30 <= 0.7
+
+
+@pytest.mark.skipif(not (real_data() / "right_whales").is_dir(), reason="needs ../shared/data")
+def test_the_model_that_ships_finds_real_whales_that_were_held_out() -> None:
+    made = held_out_photographs({"ours": open_detector(available()["ours"])})["ours"]
+    assert made.pictures == 20
+    assert made.average_precision() >= 0.9

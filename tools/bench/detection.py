@@ -1,0 +1,198 @@
+"""`podwatch bench detection`: the model that ships and its half-width and 8-bit sisters against their bars.
+
+Rendered scenes come from the split `val`: species, waters and seeds that the trainer never draws, seen as a
+drone's camera of 640x480 px sees them. An animal counts where a person who draws boxes would mark it; the
+rule is in tools/render/visible.py, and the figures show how recall falls towards it. All shares are at IoU
+0.5 and the confidence at which the detector flies.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import models
+from procs.detector.yolo import Detector
+from tools.bench.detection_figures import draw
+from tools.bench.detection_measure import (
+    CONFIDENCE,
+    CONFIDENCES,
+    Tally,
+    held_out_photographs,
+    look,
+    open_detector,
+    rendered,
+)
+from tools.bench.table import Row, bench_console, measured, print_table, write_table
+
+__all__ = ["Measures", "command", "sets"]
+
+FRAMES = 1407  # as many as the paper has
+COUNT_SCENES = 200
+COUNTS = range(1, 11)
+EMPTY_SCENES = 500
+QUICK = 24  # scenes a set
+FILES = {"ours": "detector.onnx", "half width": "detector_half.onnx", "int8": "detector_int8.onnx"}
+# The paper's Table 1: overall accuracy, false positive and false negative rate, %.
+PAPER = {
+    "YOLOv8s": (98.29, 1.05, 0.66),
+    "YOLOv8n": (96.88, 1.95, 1.17),
+    "YOLOv11n": (96.25, 2.46, 1.29),
+    "YOLOv11s": (95.81, 1.18, 3.01),
+    "DETR": (58.08, 9.70, 32.22),
+}
+
+
+@dataclass
+class Measures:
+    """What the rows and the figures are made of; filled set by set."""
+
+    seed: int
+    quick: bool = False
+    paths: dict[str, Path] = field(default_factory=dict)  # by model
+    frames: dict[str, Tally] = field(default_factory=dict)  # by model
+    counts: dict[int, Tally] = field(default_factory=dict)  # by number of animals, ours
+
+    @property
+    def ours(self) -> dict[str, Detector]:
+        return {"ours": open_detector(self.paths["ours"])}
+
+    def scenes(self, full: int) -> int:
+        return min(full, QUICK) if self.quick else full
+
+
+def available(model: Path | None = None) -> dict[str, Path]:
+    """The models that ship and are there; or one of the caller's own."""
+    if model is not None:
+        return {"ours": model}
+    folder = models.path(FILES["ours"]).parent
+    return {name: folder / file for name, file in FILES.items() if (folder / file).is_file()}
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.2f} %"
+
+
+def _frame_rows(m: Measures) -> Iterator[Row]:
+    """Recall and precision, then Table 1's columns of every model and of the paper's."""
+    n, seed = m.scenes(FRAMES), f"val {m.seed}"
+    detectors = {name: open_detector(path) for name, path in m.paths.items()}
+    m.frames = look(detectors, rendered(n, m.seed, "val"))
+    found, false, missed = m.frames["ours"].counts()
+    recall, precision = found / max(found + missed, 1), found / max(found + false, 1)
+    yield Row("rendered validation: recall", n, seed, _percent(recall), "97 %", "99 %", recall >= 0.97)
+    yield Row(
+        "rendered validation: precision", n, seed, _percent(precision), "95 %", "98.5 %", precision >= 0.95
+    )
+    for name in FILES:
+        if name not in m.frames:
+            yield Row(f"Table 1, {name}", n, seed, None, why=f"there is no models/{FILES[name]}")
+            continue
+        yield from _table_1(f"Table 1, {name}", m.frames[name], n, seed)
+
+
+def _table_1(name: str, tally: Tally, n: int, seed: str) -> Iterator[Row]:
+    """Shares of all boxes, right, false and missing, which add up to one as the paper's do."""
+    found, false, missed = tally.counts()
+    whole = max(found + false + missed, 1)
+    yield Row(
+        f"{name}: overall accuracy", n, seed, _percent(found / whole), "97 %", "98.5 %", found / whole >= 0.97
+    )
+    yield Row(
+        f"{name}: false positives", n, seed, _percent(false / whole), "2 %", "0.8 %", false / whole <= 0.02
+    )
+    yield Row(
+        f"{name}: false negatives",
+        n,
+        seed,
+        _percent(missed / whole),
+        "1.5 %",
+        "0.6 %",
+        missed / whole <= 0.015,
+    )
+
+
+def paper_rows() -> Iterator[Row]:
+    """The paper's own, for comparison: other pictures, other animals."""
+    for name, (accuracy, false, missed) in PAPER.items():
+        yield Row(f"Table 1, {name}, the paper's", 1407, "-", f"{accuracy} / {false} / {missed} %")
+
+
+def _count_rows(m: Measures) -> Iterator[Row]:
+    """Exact counts of one to ten animals."""
+    n, ours = m.scenes(COUNT_SCENES), m.ours
+    for animals in (1, 5, 10) if m.quick else COUNTS:
+        m.counts[animals] = look(ours, rendered(n, m.seed, "val", animals))["ours"]
+        shares = [m.counts[animals].exact_share(confidence) for confidence in CONFIDENCES]
+        floor, aim = {5: ("90 %", ""), 10: ("", "95 %")}.get(animals, ("", ""))
+        figure = " / ".join(f"{100 * share:.1f}" for share in shares) + " %"
+        passed = shares[0] >= 0.9 if floor else None
+        name = f"exact count of {animals}, at confidence {' / '.join(map(str, CONFIDENCES))}"
+        yield Row(name, n, f"val {m.seed}", figure, floor, aim, passed)
+
+
+def _photograph_rows(m: Measures) -> Iterator[Row]:
+    tally = held_out_photographs(m.ours)["ours"]
+    figure = tally.average_precision()
+    name = "right whale photographs, the held-out fifth: AP50"
+    yield Row(name, tally.pictures, "-", f"{figure:.3f}", "0.85", "0.95", figure >= 0.85)
+
+
+def _empty_rows(m: Measures) -> Iterator[Row]:
+    n = m.scenes(EMPTY_SCENES)
+    tally = look(m.ours, rendered(n, m.seed, "empty"))["ours"]
+    _, false, _ = tally.counts()
+    name = "false alarms an empty sea picture"
+    yield Row(name, n, f"empty {m.seed}", f"{false / n:.3f}", "0.05", "0.01", false / n <= 0.05)
+
+
+def _time_rows(m: Measures) -> Iterator[Row]:
+    from tools.bench.detection_speed import speed
+
+    for name, floor, aim in (("ours", 10.0, 5.0), ("int8", 7.0, 3.0)):
+        title = f"ms an image at 320 from 720p, one thread, {'float' if name == 'ours' else name}"
+        if name not in m.paths:
+            yield Row(title, 0, "-", None, why=f"there is no models/{FILES[name]}")
+            continue
+        parts = speed(m.paths[name])
+        whole = parts["infer"] + parts["outside"]
+        yield Row(title, 210, "5", f"{whole:.1f} ms", f"{floor:g} ms", f"{aim:g} ms", whole <= floor)
+
+
+def _corruption_rows(m: Measures) -> Iterator[Row]:
+    from tools.bench.detection_corruptions import survival
+
+    survived, n = survival(m.paths["ours"])
+    yield Row("corruptions of the input survived", n, "-", f"{survived} of {n}", "all", "all", survived == n)
+
+
+def sets(m: Measures) -> list[tuple[str, Callable[[], Iterator[Row]]]]:
+    """The parts of the benchmark in the order of the bars."""
+    return [
+        ("rendered validation", lambda: _frame_rows(m)),
+        ("the paper's Table 1", paper_rows),
+        ("exact counts", lambda: _count_rows(m)),
+        ("photographs", lambda: _photograph_rows(m)),
+        ("empty seas", lambda: _empty_rows(m)),
+        ("time", lambda: _time_rows(m)),
+        ("corruptions", lambda: _corruption_rows(m)),
+    ]
+
+
+def command(
+    seed: int, out: Path, *, quick: bool, model: Path | None = None, draw_into: Path | None = None
+) -> None:
+    """Measure all, print the table, write bench_detection.json and the figures.
+
+    quick: few scenes a set, for a look and for tests. model: another ONNX file than the one that ships.
+    draw_into: folder of the figures, `out` where None.
+    """
+    console = bench_console()
+    m = Measures(seed, quick, available(model))
+    rows: list[Row] = []
+    for name, measure in sets(m):
+        with console.status(name):
+            rows += measured(measure(), name)
+    print_table(f"podwatch bench detection, confidence {CONFIDENCE}", rows, console)
+    write_table(out / "bench_detection.json", rows)
+    for path in draw(m.frames.get("ours"), m.counts, draw_into or out):
+        console.print(f"Figure: {path}", highlight=False)

@@ -1,0 +1,154 @@
+"""Where the trainer's pictures come from, and how a batch of one step is put together from them."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+
+from tools.train.detector.photographs import empty_seas, photograph_sample
+from tools.train.detector.samples import (
+    WITH_EXTRAS,
+    Sample,
+    augment,
+    cached_scenes,
+    held_out,
+    letterboxed,
+    read_yolo,
+    real_data,
+    scene_sample,
+)
+
+__all__ = ["Batches", "Mixture", "own_pictures", "photographs"]
+
+SCENES_A_FILE = 1000  # rendered at a time: a killed run loses no more
+
+
+@dataclass(frozen=True)
+class Mixture:
+    """What a batch is made of."""
+
+    seed: int = 0
+    batch: int = 16  # the smallest whose normalisation statistics are steady; larger ones cost steps
+    side: int = 320  # what the exported network takes
+    photograph_share: float = 0.35  # of the samples; the rest are rendered
+    own_share: float = 0.5  # of the samples are the user's own pictures, where there are any
+    empty_share: float = 0.12  # of the rendered samples at least: boats and foam must not pass for whales
+    letterbox_share: float = 0.4  # cameras are wide, the network's input is square
+    scenes: int = 8000  # rendered once: more of them cost disk and time, crops vary them
+    scenes_on_photographs: int = 2000  # of them in addition: rendered animals on real water
+    scenes_seed: int = 0
+
+
+class Batches(torch.utils.data.Dataset[tuple[torch.Tensor, list[torch.Tensor]]]):
+    """Batch number k: images (B, side, side, 3) uint8 RGB, and (N, 5) boxes an image; of (seed, k) alone."""
+
+    def __init__(self, mixture: Mixture, cache: Path, data: Path | None, steps: int) -> None:
+        outlines = real_data() / "whale_outlines" / "outlines.csv"
+        self.mixture, self.steps = mixture, steps
+        self.photographs = photographs()
+        self.rendered: list[Sample] = []
+        seas = empty_seas([photo for photo in self.photographs if photo.name not in WITH_EXTRAS])
+        for count, surfaces in ((mixture.scenes, []), (mixture.scenes_on_photographs if seas else 0, seas)):
+            for start in range(0, count, SCENES_A_FILE):
+                some, seed = min(SCENES_A_FILE, count - start), mixture.scenes_seed + start // SCENES_A_FILE
+                self.rendered += cached_scenes(cache, some, seed, "train", outlines, surfaces)
+        self.empty = [sample for sample in self.rendered if len(sample.boxes) == 0]
+        self.own = own_pictures(data) if data is not None else []
+
+    def __len__(self) -> int:
+        return self.steps
+
+    def __getitem__(self, step: int) -> tuple[torch.Tensor, list[torch.Tensor]]:
+        rng = np.random.default_rng([self.mixture.seed, step])
+        side, count = self.mixture.side, self.mixture.batch
+        images, boxes = np.empty((count, side, side, 3), np.uint8), []
+        for index in range(count):
+            sample = self._sample(rng)
+            sample = Sample(augment(sample.image, rng), sample.boxes)
+            if rng.random() < self.mixture.letterbox_share:
+                sample = letterboxed(sample, rng)
+            images[index] = sample.image[..., ::-1]
+            boxes.append(torch.from_numpy(sample.boxes.astype(np.float32)))
+        return torch.from_numpy(images), boxes
+
+    def _sample(self, rng: np.random.Generator) -> Sample:
+        m = self.mixture
+        if self.own and rng.random() < m.own_share:
+            return photograph_sample(self.own, self.empty, rng, m.side)
+        if self.photographs and rng.random() < m.photograph_share:
+            return photograph_sample(self.photographs, self.empty, rng, m.side)
+        pool = self.empty if self.empty and rng.random() < m.empty_share else self.rendered
+        return scene_sample(pool[int(rng.integers(len(pool)))], rng, m.side)
+
+
+def photographs() -> list[Sample]:
+    """Four fifths of the right whales and the minke of ../shared/data; empty where it is missing."""
+    root, photos = real_data(), []
+    folder = root / "right_whales"
+    if folder.is_dir():
+        chosen, _ = held_out(sorted((folder / "images").glob("*.jpg")))
+        photos += read_yolo(chosen, folder / "labels")
+    minke = root / "minke_photogrammetry" / "minke.jpg"
+    image = cv2.imread(str(minke), cv2.IMREAD_COLOR) if minke.is_file() else None
+    if image is not None:
+        # The box was measured by eye, snout to flukes; the caption below is cut off.
+        small = cv2.resize(image[:1900], None, fx=0.4, fy=0.4, interpolation=cv2.INTER_AREA)
+        box = np.array([[82, 256, 1080, 544, 1]], np.float32)
+        photos.append(Sample(np.asarray(small, np.uint8), box))
+    return photos
+
+
+def own_pictures(data_yaml: Path, part: str = "train") -> list[Sample]:
+    """The pictures that `part` of a YOLO data.yaml names, whose labels lie in labels/ beside images/.
+
+    The entry is a folder, a text file that lists pictures, or a list of either. Every class counts as the one
+    that the network knows. Raises ValueError naming what is wrong.
+    """
+    if not data_yaml.is_file():
+        raise ValueError(f"{data_yaml}: no such file; give the data.yaml of a YOLO data set")
+    entries = _entries(data_yaml.read_text())
+    if not entries.get(part):
+        raise ValueError(f"{data_yaml}: has no entry {part!r}; it must name the folder of its pictures")
+    root = data_yaml.parent / (entries.get("path") or ["."])[0]
+    found = [path for name in entries[part] for path in _listed(root, name)]
+    if not found:
+        raise ValueError(f"{data_yaml}: no JPEG, PNG or BMP pictures in {root / entries[part][0]}")
+    samples: list[Sample] = []
+    for folder in sorted({path.parent for path in found}):
+        samples += read_yolo([path for path in found if path.parent == folder], _labels_beside(folder))
+    return samples
+
+
+def _entries(text: str) -> dict[str, list[str]]:
+    """What stands under each key at the left border of a data.yaml: one text, or the items of a list."""
+    entries: dict[str, list[str]] = {}
+    key = ""
+    for line in text.splitlines():
+        line = line.split(" #")[0].rstrip()
+        item = line.strip()
+        if item.startswith("- ") and key:
+            entries[key].append(item[2:].strip().strip("'\""))
+        elif line and not line.startswith((" ", "#", "-")) and ":" in line:
+            key, _, value = (part.strip() for part in line.partition(":"))
+            items = value.strip("[]").split(",") if value else []
+            entries[key] = [item.strip().strip("'\"") for item in items]
+    return entries
+
+
+def _listed(root: Path, name: str) -> Sequence[Path]:
+    """The pictures of a folder, or of a text file with one picture a line."""
+    place = (root / name).resolve()
+    if place.suffix == ".txt" and place.is_file():
+        lines = [line.strip() for line in place.read_text().splitlines()]
+        return [(root / line).resolve() for line in lines if line]
+    return sorted(p for p in place.glob("*") if p.suffix.lower() in (".jpg", ".jpeg", ".png", ".bmp"))
+
+
+def _labels_beside(images: Path) -> Path:
+    """labels/ in the place of the last images/ of a path; the same folder where it has none."""
+    parts = list(images.parts)
+    where = max((index for index, part in enumerate(parts) if part == "images"), default=-1)
+    return Path(*parts[:where], "labels", *parts[where + 1 :]) if where >= 0 else images
