@@ -58,6 +58,7 @@ class SimAutopilot:
         compass_error_deg: float = 5.0,
         ready_s: float = READY_S,
         start_s: float = 0.0,
+        utc_us: int = 0,
     ) -> None:
         self.vehicle = vehicle
         self._codec = Codec(system_id, AUTOPILOT_COMPONENT)
@@ -67,6 +68,7 @@ class SimAutopilot:
         self.flight = Flight(vehicle, self._estimate, start_s + ready_s)
         self.flight.parameters["MAV_SYSID"] = float(system_id)
         self._t_s = start_s
+        self._utc_us = utc_us
         self._boot(start_s)
 
     def restart(self, t_s: float) -> None:
@@ -118,6 +120,7 @@ class SimAutopilot:
             mavlink.MAVLINK_MSG_ID_SYS_STATUS: self._say_status,
             mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: self._say_landed,
             mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN: self._say_origin,
+            mavlink.MAVLINK_MSG_ID_SYSTEM_TIME: self._say_time,
         }
 
     def _is_for_us(self, message: Any) -> bool:
@@ -242,6 +245,11 @@ class SimAutopilot:
         self._codec.send.sys_status_send(
             0, 0, 0, 0, round(10500 + 2100 * left), -1, round(100 * left), 0, 0, 0, 0, 0, 0
         )
+
+    def _say_time(self, t_s: float) -> None:
+        """UTC only with a fix, as GPS brings it."""
+        utc_us = self._utc_us + round(t_s * 1e6) if self._utc_us and self._origin_is_set else 0
+        self._codec.send.system_time_send(utc_us, self._boot_ms(t_s))
 
     def _say_landed(self, _t_s: float) -> None:
         flight = self.flight

@@ -57,6 +57,7 @@ class WorldSettings:
     gps_noise_m: float
     compass_error_deg: float
     wind_m_s: float
+    utc_us: int = 0  # since 1970 at the world's time 0; 0: its GPS tells no time
 
 
 class World:
@@ -100,6 +101,7 @@ class World:
                 origin=settings.origin,
                 gps_noise_m=settings.gps_noise_m,
                 compass_error_deg=settings.compass_error_deg,
+                utc_us=settings.utc_us,
             )
 
     def step_to(self, now_us: int) -> None:

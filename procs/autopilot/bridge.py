@@ -111,6 +111,7 @@ class Bridge:
         heard_us = telemetry.heartbeat_utime
         return {
             "utime": telemetry.position_utime or 0,
+            "utc_us": telemetry.utc_us(telemetry.position_utime) if telemetry.position_utime else 0,
             "n_m": n_m,
             "e_m": e_m,
             "d_m": d_m,

@@ -13,6 +13,7 @@ __all__ = ["STREAMS_HZ", "Telemetry"]
 
 POSITION_FRESH_US = 1_000_000
 LINK_LOST_US = 3_000_000  # three heartbeats missed: the autopilot may have restarted
+EARLIEST_UTC_US = 1_577_836_800_000_000  # 2020: a clock without GPS counts from 1970 or from its making
 CLOCK_SLACK_MS = 1000  # of disorder in time_boot_ms that is not yet a restart
 
 STREAMS_HZ = (
@@ -21,6 +22,7 @@ STREAMS_HZ = (
     (mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE, 5.0),
     (mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN, 1.0),
     (mavlink.MAVLINK_MSG_ID_SYS_STATUS, 1.0),
+    (mavlink.MAVLINK_MSG_ID_SYSTEM_TIME, 1.0),
 )
 
 
@@ -33,6 +35,7 @@ class Telemetry:
         self.battery = -1.0  # 0-1, the last that was told; below 0 until one is
         self._is_armed_known = False
         self.is_known = False  # heard enough to speak for the vehicle: armed, and what the battery holds
+        self._utc_offset_us: int | None = None  # UTC = the bridge's time + this
         self.text = ""  # the last warning that the autopilot sent, for people
         self.forget()
 
@@ -69,6 +72,10 @@ class Telemetry:
         if self._offset is None or self.position_utime is None:
             return False
         return utime - self.position_utime <= POSITION_FRESH_US
+
+    def utc_us(self, utime: int) -> int:
+        """Microseconds since 1970 at `utime`, 0 while the autopilot does not know them."""
+        return 0 if self._utc_offset_us is None else utime + self._utc_offset_us
 
     def link_ok(self, utime: int) -> bool:
         """Whether the autopilot was heard lately."""
@@ -107,6 +114,8 @@ class Telemetry:
             self.is_known = self._is_armed_known
             if message.battery_remaining >= 0:
                 self.battery = message.battery_remaining / 100
+        elif kind == "SYSTEM_TIME" and message.time_unix_usec >= EARLIEST_UTC_US:
+            self._utc_offset_us = message.time_unix_usec - utime
         elif kind == "STATUSTEXT" and message.severity <= mavlink.MAV_SEVERITY_WARNING:
             text = message.text
             self.text = text if isinstance(text, str) else text.decode(errors="replace")

@@ -12,6 +12,7 @@ from drivers.sim.vehicle import Vehicle, Wind
 from lcmtypes import make
 from lcmtypes.podwatch import setpoint_t
 from procs.autopilot.bridge import Bridge
+from procs.autopilot.telemetry import STREAMS_HZ
 from procs.settings import Mission
 
 TICK_US = 10_000
@@ -21,6 +22,7 @@ HOME = (10.0, 20.0)
 DRONE_ID = 1
 CALM = Wind()
 ORIGIN = (15.30, -61.50, 0.0)
+UTC_US = 1_790_000_000_000_000  # when the bridge's clock was 0
 
 
 class Rig:
@@ -42,6 +44,7 @@ class Rig:
             gps_noise_m=gps_noise_m,
             compass_error_deg=compass_error_deg,
             start_s=self.utime / 1e6,
+            utc_us=UTC_US,
         )
         self.want: setpoint_t | None = None
         self.bridge_alive = True
@@ -327,7 +330,7 @@ def test_streams_are_asked_for_again_after_the_autopilot_restarts(rig):
     rig.twin.restart(rig.utime / 1e6)
     rig.sent.clear()
     rig.fly(2.9)
-    assert len({m.param1 for m in rig.commands(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL)}) == 5
+    assert len({m.param1 for m in rig.commands(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL)}) == len(STREAMS_HZ)
     assert not rig.state["position_ok"]
     rig.fly(8)
     assert rig.state["position_ok"]
@@ -342,7 +345,7 @@ def test_all_is_asked_for_again_after_a_gap_in_the_heartbeats(rig):
     rig.bridge_alive = True
     rig.sent.clear()
     rig.fly(1.5)
-    assert len(rig.commands(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL)) == 5
+    assert len(rig.commands(mavlink.MAV_CMD_SET_MESSAGE_INTERVAL)) == len(STREAMS_HZ)
     asked = [m.param_id for m in rig.sent if m.get_type() == "PARAM_SET"]
     names = [name for name in asked if name in rig.twin.flight.parameters]  # others it repeats: no answer
     assert sorted(names) == sorted(set(names))
@@ -443,3 +446,12 @@ def test_the_whole_of_both_costs_little(flying):
     flying.sent.clear()
     flying.fly(10, kind=setpoint_t.GOTO, n_m=12.0, e_m=20.0, d_m=-20.0)
     assert len(flying.sent) / 10 < 32
+
+
+def test_the_time_of_day_is_that_of_the_gps_once_it_has_a_fix():
+    rig = Rig()
+    rig.tick({})
+    assert rig.state["utc_us"] == 0
+    rig.fly_until(lambda: rig.state["utc_us"] > 0, 30.0)
+    rig.fly(5.0)
+    assert rig.state["utc_us"] - rig.state["utime"] == pytest.approx(UTC_US, abs=100_000)

@@ -33,7 +33,7 @@ def ignore(_):
     """A log's warnings are not what is tested here."""
 
 
-def write(path, drone_id=1, *, offset_us=0, links=()):
+def write(path, drone_id=1, *, offset_us=0, links=(), utc_us=0):
     """A drone that flies north at 2 m/s and watches animal 3, 10 m east of its start; it sees 5 once."""
     mission = Mission(origin=ORIGIN)
     writer = LogWriter(path, drone_id=drone_id, metadata={"mission": mission.model_dump_json(), "seed": "1"})
@@ -51,6 +51,8 @@ def write(path, drone_id=1, *, offset_us=0, links=()):
             messages[channels.TRACK] = _track()
         if k % 10 == 0:
             messages[channels.HEARTBEAT] = _heartbeat(k)
+        if utc_us and k >= 12:  # the GPS has a fix
+            messages[channels.VEHICLE_STATE].utc_us = utc_us + 100_000 * k
         for channel, message in messages.items():
             message.utime = utime
             writer.write(channel, message.encode(), utime + 1000)
@@ -143,7 +145,7 @@ def test_gdal_reads_the_geojson(log, tmp_path):
     assert set(animal["properties"]["uncertainties_m"]) == {0.5}
     assert once["properties"]["uncertainties_m"] == [1.25]
     assert "coordTimes" not in drone["properties"]
-    assert "no log knows the wall time" in document["description"]
+    assert "no drone's GPS told the time" in document["description"]
     assert len(geometry) == 3
 
 
@@ -160,6 +162,16 @@ def test_gdal_reads_the_gpx_with_its_times(log, tmp_path):
     assert points["desc"][3] == "MONITOR, watching animal 3"
     assert points["desc"][-1] == "seen by drone 1, within 1.25 m"
     assert path.read_text().count("<podwatch:uncertainty_m>0.50<") == SECONDS
+
+
+def test_times_are_those_of_the_gps_where_it_told_one(tmp_path):
+    began = datetime(2026, 5, 1, 9, 30, tzinfo=UTC)
+    path = write(tmp_path / "drone_1.mcap", utc_us=round(began.timestamp() * 1e6))
+    recording = Recording([path], ignore)
+    # The first message is written 0 to 1 ms beside the instant that it tells of.
+    assert abs((recording.began - began).total_seconds()) < 0.01
+    rows = exported(path, tmp_path, "csv").read_text().splitlines()
+    assert "2026-05-01T09:30:01" in rows[2]
 
 
 def test_the_csv_has_its_units_in_its_header(log, tmp_path):

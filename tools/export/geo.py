@@ -1,7 +1,7 @@
 """Tracks as GeoJSON (RFC 7946), CSV and GPX 1.1, for maps and tables.
 
-No log knows the wall time: where it is not given, times count from 1970-01-01T00:00:00Z at the logs' first
-message, and each file says so.
+Where no drone's GPS told the time and nobody gives it, times count from 1970-01-01T00:00:00Z at the logs'
+first message, and each file says so.
 """
 
 import csv
@@ -28,8 +28,8 @@ ABOUT = (
 )
 TIMES = {
     True: "Times are UTC.",
-    False: "Times count from the logs' first message, not from 1970: no log knows the wall time, --began "
-    "gives it.",
+    False: "Times count from the logs' first message, not from 1970: no drone's GPS told the time; "
+    "--began gives it.",
 }
 
 

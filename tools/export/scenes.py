@@ -4,7 +4,7 @@ import json
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
-from datetime import datetime
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ import pymap3d
 
 from drivers.cameras.replay import RAW_FORMAT, decode_picture
 from lcmtypes import channels
-from lcmtypes.podwatch import heartbeat_t, track_t
+from lcmtypes.podwatch import heartbeat_t, track_t, vehicle_state_t
 from logs.exceptions import LogError
 from logs.fleet import Fleet, FleetMessage, Report, find_logs
 from logs.sequence import read_head
@@ -134,10 +134,12 @@ class Recording:
     """The logs of one or more drones. Raises LogError as Fleet does, and where no log tells the origin."""
 
     def __init__(self, paths: list[Path], report: Report, began: datetime | None = None) -> None:
-        """began: wall time of the logs' first message, which no log knows; without it times count from 0."""
+        """began: UTC of the logs' first message, in place of what the drones' GPS told. Where nobody knows it
+        times count from 0.
+        """
         self.fleet = Fleet(find_logs(paths), report)
-        self.began = began
         self.begin_us = next((entry.at_us for entry in self.fleet.messages()), 0)
+        self.began = began or _began(self.fleet, self.begin_us)
         self._origin = _origin(self.fleet)
 
     def time_s(self, at_us: int) -> float:
@@ -306,6 +308,17 @@ class _View:
 def colour_of(animal: int) -> tuple[int, int, int]:
     """(red, green, blue), 0-255, of an animal; grey for none."""
     return NOBODY if animal < 0 else COLOURS[animal % len(COLOURS)]
+
+
+def _began(fleet: Fleet, begin_us: float) -> datetime | None:
+    """UTC of the first message, by the first drone whose GPS told the time."""
+    for entry in fleet.messages():
+        if entry.raw.channel == channels.VEHICLE_STATE:
+            state = vehicle_state_t.decode(entry.raw.data)
+            if state.utc_us:
+                after_us = fleet.lines[entry.drone_id].at(state.utime) - begin_us
+                return datetime.fromtimestamp((state.utc_us - after_us) / 1e6, tz=UTC)
+    return None
 
 
 def _origin(fleet: Fleet) -> tuple[float, float, float]:

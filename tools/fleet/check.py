@@ -88,11 +88,13 @@ def _addresses(mission: Mission) -> Iterator[Finding]:
 
 def _model(spec: DriverSpec) -> Finding:
     """Load it, as the detector will."""
+    own = spec.options.get("model_path")
     try:
         load_driver(spec)
     except RuntimeFailure as error:
-        return Finding("model", lacks=str(error), mend="pip install --force-reinstall podwatch")
-    return Finding("model", str(spec.options.get("model_path") or "the detector that ships"))
+        mend = "[detector] model = ...: another file" if own else "pip install --force-reinstall podwatch"
+        return Finding("model", lacks=str(error), mend=mend)
+    return Finding("model", str(own or "the detector that ships"))
 
 
 def _camera(mission: Mission, machine: MachineSettings, spec: DriverSpec) -> Finding:

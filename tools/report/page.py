@@ -13,13 +13,14 @@ import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from datetime import datetime
+from datetime import UTC, datetime
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
 from jinja2 import Environment, StrictUndefined
 
+from lcmtypes import channels
 from tools.report import words
 from tools.report.events import Event, list_events
 from tools.report.findings import GRAVE, NOTE, Finding, find_findings, sentence
@@ -64,7 +65,12 @@ class Section:
 
     @property
     def began(self) -> str:
-        """Date and time as the run's folder is named by, empty where it is not."""
+        """Date and time by a drone's GPS, else as the run's folder is named by, empty where it is not."""
+        for samples in self.flight.run.messages.values():
+            for t_s, state in samples.get(channels.VEHICLE_STATE, ()):
+                if state.utc_us:
+                    began = datetime.fromtimestamp(state.utc_us / 1e6 - t_s, tz=UTC)
+                    return began.strftime("%-d %B %Y, %H:%M UTC")
         found = FOLDER_TIME.match(self.flight.name)
         if not found:
             return ""

@@ -12,6 +12,8 @@ import json
 import select
 import signal
 import sys
+import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -55,7 +57,7 @@ class WorldProcess:
             int(drone_id): MavlinkUdpClient(f"127.0.0.1:{port}", int(drone_id))
             for drone_id, port in settings["mavlink_ports"].items()
         }
-        world = plan.world_settings()
+        world = replace(plan.world_settings(), utc_us=time.time_ns() // 1000)
         self._routed = {
             int(drone_id): RoutedAutopilot(
                 open_link(address, int(drone_id)),
