@@ -112,7 +112,7 @@ class RelayShell:
         self._tell(
             "silent",
             " and ".join(self._core.silent_sides(now_us)),
-            "silent link to the living neighbour on the",
+            "link to a living neighbour is silent",
         )
         lost = self._core.members.lost(now_us)
         self._tell("lost", ", ".join(str(member) for member in lost), "lost drones")

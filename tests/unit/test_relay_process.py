@@ -110,7 +110,7 @@ def test_the_heartbeat_says_which_side_is_silent_and_what_was_refused(fleet: Fle
     fleet.run(6)
     beat = fleet.last(1, channels.HEARTBEAT, heartbeat_t)
     assert beat.status == heartbeat_t.DEGRADED
-    assert beat.detail == "silent link to the living neighbour on the: right"
+    assert beat.detail == "link to a living neighbour is silent: right"
     fleet.ether.blocked = lambda sender, receiver: False
     for _ in range(30):
         fleet.ether.carry(9, 1, b"noise")
