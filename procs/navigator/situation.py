@@ -118,6 +118,9 @@ class Memory:
     free_since_us: int = 0  # since when a surplus drone sees animals that nobody watches, 0 while it does not
     free_animals: tuple[int, ...] = ()  # those
     free_key: EpisodeKey = (0, 0)  # newest episode that had ended when they were looked at last
+    stranger_since_us: int = 0  # since when it sees, as surplus, an animal without a name; 0: not
+    stranger_key: EpisodeKey = (0, 0)  # newest episode that had ended when it asked for that last
+    n_for_strangers: int = 0  # episodes after which it did so
     n_asked: int = 0  # episodes that have ended and left them to nobody
     boat_us: int = 0  # when there was word of the boat last, 0 while there was none
     held_us: int = 0  # last instant of doubt

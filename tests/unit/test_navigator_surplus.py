@@ -68,6 +68,37 @@ def asked_s(entries: list, rows: list, seconds: float = 20.0, running: bool = Fa
     return None
 
 
+def stranger_asked_s(ids: list[int], left_px: float, episodes: int = 1) -> list[float]:
+    """When a surplus drone asks, over a minute in which every ask is answered by an episode that changes
+    nothing, at most `episodes` of them.
+    """
+    navigator = Navigator(mission(3), 1)
+    box = make(podwatch.box_t, left_px=left_px, top_px=100.0, right_px=left_px + 80, bottom_px=140.0)
+    asked: list[float] = []
+    number = 1
+    for k in range(600):
+        utime = 100 * S + k * S // 10
+        fleet = make(podwatch.fleet_state_t, utime=utime)
+        identities = make(
+            podwatch.identities_t, utime=utime, episode=number, width=640, height=480, n_boxes=len(ids),
+            boxes=[box] * len(ids), ids=ids,
+        )  # fmt: skip
+        inputs = Inputs(utime, identities=identities, fleet=fleet)
+        if surplus.asks(Situation(navigator.mission, 1, inputs, navigator.memory), navigator.memory):
+            asked.append(k / 10)
+            number += number < episodes
+    return asked
+
+
+def test_an_animal_that_the_map_does_not_know_brings_an_episode_too() -> None:
+    (first, *_) = stranger_asked_s([3, -1], 200.0)
+    assert first == pytest.approx(surplus.STRANGER_FOR_S, abs=0.2)
+    assert stranger_asked_s([3, 4], 200.0) == []
+    assert stranger_asked_s([3, -1], 1.0) == [], "cut by the picture's edge"
+    assert stranger_asked_s([3, -1], 558.0) == []
+    assert len(stranger_asked_s([-1], 200.0, episodes=99)) == surplus.MOST_ASKED
+
+
 def animal(number: int, age_ms: int = 200) -> podwatch.map_animal_t:
     return make(podwatch.map_animal_t, id=number, age_ms=age_ms)
 
