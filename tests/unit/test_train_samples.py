@@ -8,9 +8,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tools.train.detector.photographs import photograph_sample
+from tools.train.detector.photographs import empty_seas, photograph_sample
 from tools.train.detector.pictures import own_pictures
 from tools.train.detector.samples import (
+    SCENES_VERSION,
     Sample,
     augment,
     cached_scenes,
@@ -91,11 +92,29 @@ def test_augmentation_keeps_the_shape_and_repeats_for_the_same_generator() -> No
 
 def test_a_cache_that_was_cut_off_is_made_again(tmp_path: Path) -> None:
     first = cached_scenes(tmp_path, 2, 3, "train", tmp_path / "no_outlines.csv")
-    (tmp_path / "train_3_2.boxes.npz").unlink()  # written last, so a killed run has none
+    (tmp_path / f"train_3_2_v{SCENES_VERSION}.boxes.npz").unlink()  # written last, so a killed run has none
     again = cached_scenes(tmp_path, 2, 3, "train", tmp_path / "no_outlines.csv")
     for one, same in zip(first, again, strict=True):
         np.testing.assert_array_equal(one.image, same.image)
         np.testing.assert_array_equal(one.boxes, same.boxes)
+
+
+def test_the_water_beside_an_animal_is_an_empty_sea_and_a_narrow_rim_is_none() -> None:
+    wide = Sample(np.full((400, 900, 3), 50, np.uint8), np.array([[60, 100, 300, 200, 1]], np.float32))
+    wide.image[100:200, 60:300] = 250
+    filled = Sample(wide.image[:300, :320], wide.boxes)
+    (sea,) = empty_seas([wide, filled])
+    assert sea.shape == (400, 575, 3)
+    assert (sea == 50).all()
+
+
+def test_rendered_animals_swim_on_a_photograph_of_water(tmp_path: Path) -> None:
+    photograph = np.full((300, 500, 3), (90, 20, 140), np.uint8)
+    samples = cached_scenes(tmp_path, 3, 0, "train", tmp_path / "none.csv", [photograph])
+    for sample in samples:
+        assert np.median(sample.image.reshape(-1, 3), axis=0).tolist() == [90, 20, 140]
+    assert sum(len(sample.boxes) for sample in samples) > 2
+    assert len(list(tmp_path.glob("train_on_photographs_0_3_*"))) == 2
 
 
 def pictures_in(folder: Path, count: int) -> None:

@@ -19,7 +19,9 @@ Array = NDArray[np.float64]
 LEAST_SHARE = 0.3  # of its outline lies inside the picture, uncovered, and differs from the water
 LEAST_CONTRAST = 10.0  # grey levels between what shows of it and the water, and as much as the waves' own
 LEAST_LONG_SHARE = 12 / 320  # long side of the box against the picture's: 12 px in the network's input
-SEEN_LEVELS = 6  # a pixel shows the animal where it changed by this, in the colour that changed most
+# A pixel shows the animal where it changed by so much, in the colour that changed most, and by this share of
+# what the animal changes at its clearest: the rest is a fading tail that nobody would draw a box round.
+SEEN_LEVELS, SEEN_SHARE = 6.0, 0.25
 
 
 @dataclass(frozen=True)
@@ -58,7 +60,7 @@ def draw_and_see(
         inside = np.zeros((height, width), np.uint8)
         cv2.fillPoly(inside, [np.round(ring).astype(np.int32) for ring in rings[row]], 255)
         own = cv2.absdiff(image, before).max(axis=2)
-        mask[(inside > 0) & (own >= SEEN_LEVELS)] = animals[row].id + 1
+        mask[(inside > 0) & (own >= _least_change(own[inside > 0]))] = animals[row].id + 1
         np.copyto(change, own.astype(np.float32), where=inside > 0)
     boxes, oriented = np.zeros((count, 4), np.float32), np.zeros((count, 4, 2), np.float32)
     shares, contrast, noise = (np.zeros(count, np.float32) for _ in range(3))
@@ -72,6 +74,12 @@ def draw_and_see(
         contrast[row] = float(change[rows, columns].mean())
         noise[row] = float(_around(water, boxes[row]).std())
     return Visible(boxes, oriented, shares, contrast, noise, mask)
+
+
+def _least_change(changes: NDArray[np.uint8]) -> float:
+    """From which change on a pixel of an animal counts as showing it."""
+    clearest = float(np.percentile(changes, 95)) if len(changes) else 0.0
+    return max(SEEN_LEVELS, SEEN_SHARE * clearest)
 
 
 def _rings(to_image: Array, animal: AnimalView, species: Species) -> list[Array]:

@@ -23,6 +23,7 @@ from tools.train.detector.samples import (
 
 __all__ = ["Batches", "Mixture", "own_pictures", "photographs"]
 
+ENDLESS = 100_000_000  # batches; the trainer stops before
 SCENES_A_FILE = 1000  # rendered at a time: a killed run loses no more
 
 
@@ -45,7 +46,7 @@ class Mixture:
 class Batches(torch.utils.data.Dataset[tuple[torch.Tensor, list[torch.Tensor]]]):
     """Batch number k: images (B, side, side, 3) uint8 RGB, and (N, 5) boxes an image; of (seed, k) alone."""
 
-    def __init__(self, mixture: Mixture, cache: Path, data: Path | None, steps: int) -> None:
+    def __init__(self, mixture: Mixture, cache: Path, data: Path | None, steps: int = ENDLESS) -> None:
         outlines = real_data() / "whale_outlines" / "outlines.csv"
         self.mixture, self.steps = mixture, steps
         self.photographs = photographs()

@@ -26,6 +26,7 @@ from drivers.sim.render.effects import (
 from tools.render import measured_right_whales, scenes
 
 __all__ = [
+    "SCENES_VERSION",
     "WITH_EXTRAS",
     "Sample",
     "augment",
@@ -49,6 +50,7 @@ CACHE_SIDE = 384  # a little over the network's 320, so that crops and scales va
 # Photographs that show a second animal in part, without a box: boxes on it are neither right nor wrong.
 WITH_EXTRAS = ("w_6", "w_23", "w_33", "w_94")
 PAD_GREY = 114  # what the detector puts round pictures that are not square
+SCENES_VERSION = 2  # raised whenever the scenes change: what was kept of older ones is left alone
 LEAST_SHARE = 0.35  # of a box that a crop must keep for the animal to count
 
 
@@ -89,7 +91,7 @@ def cached_scenes(
 
     seas: photographs of water that take the place of the rendered one.
     """
-    name = f"{split}{'_on_photographs' if seas else ''}_{seed}_{count}"
+    name = f"{split}{'_on_photographs' if seas else ''}_{seed}_{count}_v{SCENES_VERSION}"
     images_path, boxes_path = folder / f"{name}.images.npy", folder / f"{name}.boxes.npz"
     if not boxes_path.is_file():  # written last: a killed run leaves none and begins again
         folder.mkdir(parents=True, exist_ok=True)

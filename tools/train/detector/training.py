@@ -145,7 +145,7 @@ def train(
     cv2.setNumThreads(1)
     torch.set_num_threads(settings.threads)
     out.mkdir(parents=True, exist_ok=True)
-    batches = Batches(settings.pictures, out.parent / "detector_scenes", data, 10_000_000)
+    batches = Batches(settings.pictures, out.parent / "detector_scenes", data)
     print(
         f"{len(batches.rendered)} rendered scenes ({len(batches.empty)} empty), "
         f"{len(batches.photographs)} photographs, {len(batches.own)} pictures of your own",
