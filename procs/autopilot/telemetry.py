@@ -9,11 +9,12 @@ from drivers.autopilots.ardupilot import mavlink
 from procs.autopilot.limits import Vector
 from procs.settings import OriginSettings
 
-__all__ = ["STREAMS_HZ", "Telemetry"]
+__all__ = ["EARLIEST_UTC_US", "LATEST_UTC_US", "STREAMS_HZ", "Telemetry"]
 
 POSITION_FRESH_US = 1_000_000
 LINK_LOST_US = 3_000_000  # three heartbeats missed: the autopilot may have restarted
-EARLIEST_UTC_US = 1_577_836_800_000_000  # 2020: a clock without GPS counts from 1970 or from its making
+# 2020 to 2100: a clock without GPS counts from 1970, from its making, or says all ones.
+EARLIEST_UTC_US, LATEST_UTC_US = 1_577_836_800_000_000, 4_102_444_800_000_000
 CLOCK_SLACK_MS = 1000  # of disorder in time_boot_ms that is not yet a restart
 
 STREAMS_HZ = (
@@ -114,7 +115,7 @@ class Telemetry:
             self.is_known = self._is_armed_known
             if message.battery_remaining >= 0:
                 self.battery = message.battery_remaining / 100
-        elif kind == "SYSTEM_TIME" and message.time_unix_usec >= EARLIEST_UTC_US:
+        elif kind == "SYSTEM_TIME" and EARLIEST_UTC_US <= message.time_unix_usec < LATEST_UTC_US:
             self._utc_offset_us = message.time_unix_usec - utime
         elif kind == "STATUSTEXT" and message.severity <= mavlink.MAV_SEVERITY_WARNING:
             text = message.text

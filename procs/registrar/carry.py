@@ -24,14 +24,16 @@ GATE_SPEED_M_S = 0.7
 MAX_GATE_LENGTHS = 0.6
 # A box that suits an animal that has none now nearly as well is neither's: when two come apart again, the
 # first box to be seen lies between where they were.
-AMBIGUOUS_LENGTHS = 0.25
+AMBIGUOUS_LENGTHS, AMBIGUOUS_RATIO, NOISE_LENGTHS = 0.25, 2.0, 0.1
 MAX_SHIFT_LENGTHS = 0.8  # shared by all boxes: an error of attitude, height or position
 SHIFT_PRICE = 0.5  # of one matched animal, for the largest shift
 VELOCITY_GAIN = 0.15
 # Two animals that touch come as one box about twice as long, whose middle is neither's place. A size is
-# learnt slowly upwards and faster downwards, since a first box may have been such a one.
+# learnt slowly, since an animal half under water is as long as ever; but a first box may have been such a
+# one.
 MERGED_SIZES = 1.4
-SIZE_GAIN_UP, SIZE_GAIN_DOWN = 0.05, 0.2
+SIZE_GAIN_UP, SIZE_GAIN_DOWN = 0.05, 0.03
+FIRST_SIGHTS, FIRST_GAIN_DOWN = 10, 0.2
 MAX_SPEED_M_S = 4.0
 
 
@@ -43,6 +45,7 @@ class Followed:
     utime: int
     velocity_m_s: Array = field(default_factory=lambda: np.zeros(2))
     size_m: float = np.inf  # diagonal of its box on the ground
+    n_sights: int = 0
     animal: int = -1
     candidate: int = -1  # an id that the map offers, and for how many sights running
     n_offers: int = 0
@@ -160,7 +163,7 @@ class BoxCarrier:
         distance = np.linalg.norm((ground_m - shift)[:, None] - predicted[None], axis=2)
         distance[~fits] = np.inf
         named = np.array([animal.animal >= 0 for animal in self._followed])
-        rows, columns = _match(distance, gate, named, AMBIGUOUS_LENGTHS * self._length_m)
+        rows, columns = _match(distance, gate, named, self._length_m)
         return {int(row): self._followed[column] for row, column in zip(rows, columns, strict=True)}
 
 
@@ -188,27 +191,35 @@ def _shared_shift(
 
 
 def _match(
-    distance: Array, gate: Array, named: NDArray[np.bool_], ambiguous_m: float
+    distance: Array, gate: Array, named: NDArray[np.bool_], length_m: float
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Pairs (row, column) of least total distance (N, K) m, each within its column's gate (K,) m. A row gets
-    no named column (K,) where another one without a row would suit within `ambiguous_m` as well.
+    no named column (K,) where another one without a row would suit it about as well.
     """
-    rows, columns = linear_sum_assignment(np.minimum(distance, gate[None] * 2))
-    near = distance[rows, columns] <= gate[columns]
-    rows, columns = rows[near], columns[near]
-    waiting = distance.copy()
-    waiting[:, columns] = np.inf
-    waiting[:, ~named] = np.inf
-    clear = waiting[rows].min(axis=1, initial=np.inf) > distance[rows, columns] + ambiguous_m
-    clear |= ~named[columns]
-    return rows[clear], columns[clear]
+    while True:
+        rows, columns = linear_sum_assignment(np.minimum(distance, gate[None] * 2))
+        near = distance[rows, columns] <= gate[columns]
+        rows, columns = rows[near], columns[near]
+        waiting = distance.copy()
+        waiting[:, columns] = np.inf
+        waiting[:, ~named] = np.inf
+        second, first = waiting[rows].min(axis=1, initial=np.inf), distance[rows, columns]
+        is_near = second <= first + AMBIGUOUS_LENGTHS * length_m
+        is_like = second <= AMBIGUOUS_RATIO * first + NOISE_LENGTHS * length_m
+        refused = named[columns] & is_near & is_like
+        if not refused.any():
+            return rows, columns
+        distance = distance.copy()
+        distance[np.ix_(rows[refused], np.flatnonzero(named))] = np.inf
 
 
 def _grow(animal: Followed, size_m: float) -> None:
+    animal.n_sights += 1
     if not np.isfinite(animal.size_m):
         animal.size_m = size_m
     elif np.isfinite(size_m):
-        gain = SIZE_GAIN_UP if size_m > animal.size_m else SIZE_GAIN_DOWN
+        gain_down = FIRST_GAIN_DOWN if animal.n_sights < FIRST_SIGHTS else SIZE_GAIN_DOWN
+        gain = SIZE_GAIN_UP if size_m > animal.size_m else gain_down
         animal.size_m += gain * (size_m - animal.size_m)
 
 

@@ -83,6 +83,7 @@ class RegistrarShell:
         for lost in [member for member in self._living if member not in living]:
             self._registrar.drop_member(lost)
         self._living = living
+        self._registrar.left = tuple(state.left)
         self._able = able_members(state, self._roster, self._runtime.drone_id)
 
     def on_detections(self, message: detections_t) -> None:

@@ -109,6 +109,7 @@ class Registrar:
         self.map = MapBook()
         self.correction = Correction()
         self.memory: Memory | None = None
+        self.left: tuple[int, ...] = ()  # animals that the boat ordered to leave: no other gets their ids
         self.running: Running | None = None
         self.finished: Finished | None = None
         self._handled: tuple[int, int] = (0, 0)
@@ -231,6 +232,7 @@ class Registrar:
             view=view,
             memory=memory,
             is_blind=look.sighting is None,
+            reserved=self.left,
             **options,
         )
         for lost in running.lost:

@@ -12,7 +12,7 @@ that the views it should lie in confirm it. A ring of one has nobody to disagree
 consensus True.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -89,11 +89,13 @@ class RingNode:
         memory: Memory | None = None,
         register: Register = align_marks,
         is_blind: bool = False,
+        reserved: Collection[int] = (),
     ) -> None:
         """`boxes` (N, 4) px of the frame at the episode's instant; `members` are drone ids in ring order.
 
         is_blind: there was no frame at that instant. Such a drone hands the map on, and its edge has no
-        confidence, so that nobody takes its silence for a confirmation.
+        confidence, so that nobody takes its silence for a confirmation. reserved: ids that no new animal
+        may get, since something still holds for whoever bore them.
 
         Raises ValueError for a drone that is no member, a repeated member or a bad box (naming the row).
         """
@@ -109,6 +111,7 @@ class RingNode:
         self.bytes_sent = 0
         self.packets_refused = 0
         self._is_blind = is_blind
+        self._reserved = frozenset(reserved)
         self._lost: list[int] = []
         self._newest: tuple[MapHeader, list[MapAnimal], bytes] | None = None
         self._sight = Sight()
@@ -249,7 +252,7 @@ class RingNode:
     def _free_id(self, by_id: dict[int, MapAnimal], now_s: float) -> int | None:
         if len(by_id) >= MAX_ANIMALS:
             return None
-        kept = {one.id for one in self.memory.known_at(now_s).animals}
+        kept = {one.id for one in self.memory.known_at(now_s).animals} | self._reserved
         return next((number for number in range(255) if number not in by_id and number not in kept), None)
 
     def _take_turn(

@@ -25,7 +25,9 @@ from procs.relay.rows import COUNTER_RANGE, NO_MARKER, Marker, Row, pack_row, un
 __all__ = ["TABLE_LIMIT_BYTES", "FleetTable", "Order"]
 
 TABLE_LIMIT_BYTES = 300
-MAX_ORDERS = 6  # the newest, and one of the rest in turn; 13 bytes each
+MAX_ORDERS = 6  # those to fly first, and one of the rest in turn; 13 bytes each
+# An order from further ahead was given in an earlier fleet time, which ended when all were switched off.
+AHEAD_US = 5_000_000
 ORDER = struct.Struct(">qBBBH")
 NO_ANIMAL = 255
 COUNTER_STEP_US = 100_000
@@ -46,7 +48,7 @@ class Order:
 
     def is_valid(self, fleet_us: int) -> bool:
         """Whether it is in force at a moment of fleet time."""
-        return fleet_us <= self.utime_us + self.expiry_s * 1_000_000
+        return self.utime_us - AHEAD_US <= fleet_us <= self.utime_us + self.expiry_s * 1_000_000
 
     def message(self) -> operator_t:
         return make(
@@ -86,7 +88,7 @@ class FleetTable:
             int, dict[int, tuple[int, int]]
         ] = {}  # to each peer, of each row: counter, how recently
         self._n_sent = 0
-        self._n_packed = 0
+        self._n_packed: dict[int, int] = {}  # tables for each peer
 
     def say(self, row: Row, born_us: int, now_us: int) -> None:
         """Set this drone's own row. `row.marker` says its find and waypoint in full. Raises RowError."""
@@ -94,11 +96,16 @@ class FleetTable:
         self._entries[self.own_id] = self._entry(row, born_us, now_us)
         self._is_own_said = True
 
-    def order(self, order: Order) -> bool:
+    def order(self, order: Order, fleet_us: int | None = None) -> bool:
         """Take in an order -> whether it is news: the newest for its target wins, and a newer one for
         everybody ends those for one. What is said of an animal stands beside them: a drone on hold hears
-        that its animal is to be left.
+        that its animal is to be left. Where fleet time is known, what is not in force neither comes in nor
+        keeps anything out.
         """
+        if fleet_us is not None:
+            self._forget_ended(fleet_us)
+            if not order.is_valid(fleet_us):
+                return False
         if order.command in ABOUT_ANIMALS:
             known = self._animal_orders.get(order.animal)
             if known is not None and known.utime_us >= order.utime_us:
@@ -120,7 +127,7 @@ class FleetTable:
         known."""
         if fleet_us is None:
             return NO_ORDER
-        self._orders = {target: order for target, order in self._orders.items() if order.is_valid(fleet_us)}
+        self._forget_ended(fleet_us)
         mine = [order for target, order in self._orders.items() if target in (BOAT_ID, drone_id)]
         return max(mine, key=lambda order: order.utime_us, default=NO_ORDER)
 
@@ -129,9 +136,7 @@ class FleetTable:
         rather an animal too few is watched.
         """
         if fleet_us is not None:
-            self._animal_orders = {
-                animal: order for animal, order in self._animal_orders.items() if order.is_valid(fleet_us)
-            }
+            self._forget_ended(fleet_us)
         orders = self._animal_orders.items()
         return sorted(animal for animal, order in orders if order.command == operator_t.LEAVE)
 
@@ -147,7 +152,7 @@ class FleetTable:
         A larger table goes as a window that moves on at each call: this drone's own row, then rows that are
         news to the peer, then the rest, each by how long ago it was sent to that peer.
         """
-        orders = self._orders_to_send()
+        orders = self._orders_to_send(peer_id)
         tail = bytes([len(orders)]) + b"".join(_pack_order(order) for order in orders)
         room = TABLE_LIMIT_BYTES - self._bitmap_bytes - len(tail)
         sent = self._sent.setdefault(peer_id, {})
@@ -164,9 +169,10 @@ class FleetTable:
         entries = [self._entries[self.ids[place]] for place in sorted(chosen)]
         return bitmap + b"".join(with_age(entry.wire, now_us - entry.born_us) for entry in entries) + tail
 
-    def merge(self, peer_id: int, data: bytes, sent_us: int) -> bool:
+    def merge(self, peer_id: int, data: bytes, sent_us: int, fleet_us: int | None = None) -> bool:
         """Take in a peer's table, sent at `sent_us` -> whether it brings what all should hear at once: an
-        order, a find. Raises ValueError where it is not laid out as `pack` does it."""
+        order, a find. fleet_us: fleet time, where it is known. Raises ValueError where it is not laid out
+        as `pack` does it."""
         bitmap, rest = int.from_bytes(data[: self._bitmap_bytes], "big"), data[self._bitmap_bytes :]
         if len(data) < self._bitmap_bytes or bitmap >> len(self.ids):
             raise ValueError(
@@ -184,7 +190,9 @@ class FleetTable:
         for member, row, wire, born_us in heard:
             self._hear_row(member, _Entry(row, wire, born_us, peer_id))
         orders = [
-            self.order(Order(utime_us, command, target, -1 if animal == NO_ANIMAL else animal, expiry_s))
+            self.order(
+                Order(utime_us, command, target, -1 if animal == NO_ANIMAL else animal, expiry_s), fleet_us
+            )
             for utime_us, command, target, animal, expiry_s in ORDER.iter_unpack(rest[1:])
         ]
         return any(orders) or self.n_finds > n_finds
@@ -203,14 +211,28 @@ class FleetTable:
         members = sorted(self._entries, key=lambda member: (member != self.own_id, member))
         return [self._message(member, member in living, now_us) for member in members]
 
-    def _orders_to_send(self) -> list[Order]:
-        """The newest first; where there are too many, the last place goes to each of the rest in turn."""
-        orders = sorted(
-            [*self._orders.values(), *self._animal_orders.values()], key=lambda order: -order.utime_us
-        )
-        newest, rest = orders[: MAX_ORDERS - 1], orders[MAX_ORDERS - 1 :]
-        self._n_packed += 1
-        return newest + ([rest[self._n_packed % len(rest)]] if rest else [])
+    def newest_order_us(self) -> int:
+        """When the newest order that is kept was given, fleet time; 0 where there is none."""
+        kept = (*self._orders.values(), *self._animal_orders.values())
+        return max((order.utime_us for order in kept), default=0)
+
+    def _forget_ended(self, fleet_us: int) -> None:
+        """Drop the orders that are not in force."""
+        for orders in (self._orders, self._animal_orders):
+            for key in [key for key, order in orders.items() if not order.is_valid(fleet_us)]:
+                del orders[key]
+
+    def _orders_to_send(self, peer_id: int) -> list[Order]:
+        """Those to fly first, the newest of each kind first; where there are too many, the last place goes to
+        each of the rest in turn.
+        """
+        kinds = (self._orders.values(), self._animal_orders.values())
+        orders = [order for kind in kinds for order in sorted(kind, key=lambda order: -order.utime_us)]
+        if len(orders) <= MAX_ORDERS:
+            return orders
+        first, rest = orders[: MAX_ORDERS - 1], orders[MAX_ORDERS - 1 :]
+        turn = self._n_packed[peer_id] = self._n_packed.get(peer_id, 0) + 1
+        return [*first, rest[turn % len(rest)]]
 
     @property
     def _bitmap_bytes(self) -> int:

@@ -114,10 +114,12 @@ class Relay:
         if self.fleet.n_finds > n_finds:
             self._spread(now_us)
 
-    def order(self, order: Order, now_us: int) -> None:
-        """Give an order to the fleet: what the boat does."""
-        if self.fleet.order(order):
+    def order(self, order: Order, now_us: int) -> bool:
+        """Give an order to the fleet, as the boat does -> whether it counts: a newer one may be known."""
+        is_news = self.fleet.order(order, self._fleet_us(now_us))
+        if is_news:
             self._spread(now_us)
+        return is_news
 
     def say(self, channel: Channel, data: bytes, utime: int, payload_bytes: int, now_us: int) -> None:
         """Send a message of the own bus to both neighbours, now or as soon as the cap allows.
@@ -209,7 +211,7 @@ class Relay:
         neighbours: Neighbours = self.members.neighbours(now_us)
         is_ok = self.fleet_clock.is_ok(now_us)
         offset_us = round(self.fleet_clock.offset_us)
-        fleet_us = now_us + offset_us if is_ok else None
+        fleet_us = self._fleet_us(now_us)
         heard = [*living, *(member for member in (BOAT_ID,) if self.members.lives(member, now_us))]
         rows = self.fleet.rows(heard, now_us)
         left = self.fleet.left(fleet_us)
@@ -229,6 +231,11 @@ class Relay:
             n_left=len(left),
             left=left,
         )
+
+    def _fleet_us(self, now_us: int) -> int | None:
+        """Fleet time, None where it is not known."""
+        is_ok = self.fleet_clock.is_ok(now_us)
+        return now_us + round(self.fleet_clock.offset_us) if is_ok else None
 
     def link_state(self, now_us: int) -> link_state_t:
         """LINK_STATE: the neighbours' links, and any other that was used since the last report."""
@@ -298,7 +305,8 @@ class Relay:
 
     def _hear(self, link: Link, body: datagram.Body, now_us: int) -> None:
         sent_us = link.sent_here_us(body.stamp_us, now_us)
-        is_news = body.table is not None and self.fleet.merge(link.peer_id, body.table, sent_us)
+        fleet_us = self._fleet_us(now_us)
+        is_news = body.table is not None and self.fleet.merge(link.peer_id, body.table, sent_us, fleet_us)
         self.members.hear(link.peer_id, sent_us, now_us)
         self.members.merge(body.ages, sent_us, now_us)
         link.hear(body, now_us)

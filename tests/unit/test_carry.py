@@ -171,6 +171,41 @@ def test_the_first_box_after_two_came_together_is_given_neithers_id():
     assert (after[0], after[1]) in ((-1, IDS[1]), (IDS[0], IDS[1]))
 
 
+def test_an_animal_half_under_water_for_a_while_keeps_its_id_when_it_is_whole_again():
+    film = Film(np.array([[0.0, 0.0]]))
+    ids = []
+    for size_m in [9.0] * 20 + [5.0] * 15 + [9.0] * 5:
+        film.utime += FRAME_US
+        seen = film.carrier.update(film.utime, np.zeros((1, 4)), np.zeros((1, 2)), None, np.array([size_m]))
+        ids += seen.ids
+    assert ids == [IDS[0]] * 40
+
+
+@pytest.mark.parametrize("apart_m", [2.8, 4.0])
+def test_a_calf_beside_its_mother_that_dives_takes_no_name_away(apart_m):
+    film = Film(np.array([[0.0, 0.0], [apart_m, 0.0]]))
+    random = np.random.default_rng(1)
+    for _ in range(10):
+        film.see([0, 1])
+    for _ in range(30):
+        film.animals[0] = random.normal(0, 0.15, 2)
+        assert film.see([0]) == {0: IDS[0]}
+    assert film.see([0, 1]) == named([0, 1])
+
+
+def test_a_box_that_is_given_no_name_is_one_and_the_same_from_then_on():
+    """What the map offers must come for the same one several times running."""
+    film = Film(np.array([[0.0, 0.0], [6.5, 0.0]]))
+    for _ in range(5):
+        film.see([])
+    film.animals[0] = [3.0, 0.0]
+    first = film._frame(np.array([0]), np.zeros(2))
+    for _ in range(4):
+        film.utime += FRAME_US
+        again = film._frame(np.array([0]), np.zeros(2))
+        assert again.followed[0] is first.followed[0]
+
+
 def test_a_size_first_seen_too_large_comes_down():
     film = Film(np.array([[0.0, 0.0]]))
     for size_m in (18.0, 18.0, *[9.0] * 12):

@@ -239,6 +239,16 @@ def test_a_pod_watched_while_its_animals_changed_places_keeps_their_ids():
     assert fleet.names(1) == fleet.names(2) == before
 
 
+def test_a_new_animal_gets_no_number_that_the_boat_ordered_to_leave():
+    fleet = Fleet(3)
+    for registrar in fleet.registrars.values():
+        registrar.left = (0, 3)
+    fleet.run(2.0)
+    fleet.propose(1)
+    fleet.run(7.0)
+    assert sorted(fleet.names(1).values()) == [1, 2, 4, 5, 6]
+
+
 def test_a_drone_that_never_answers_makes_the_episode_incomplete_but_does_not_hang_it():
     fleet = Fleet(3)
     fleet.run(2.0)

@@ -331,3 +331,29 @@ def test_after_any_troubles_the_fleet_is_whole_again(seed: int) -> None:
         assert not drone.state.is_line
         assert drone.state.n_rows == n
         assert max(row.age_ms for row in drone.state.rows) < 5_000
+
+
+@pytest.mark.parametrize("command", [operator_t.HOLD, operator_t.LEAVE])
+def test_an_order_of_a_fleet_time_that_has_ended_does_not_keep_newer_ones_out(command: int) -> None:
+    """All drones are switched off for longer than any clock is kept, and the boat's program runs on."""
+    fleet = Fleet(3, boat=True)
+    fleet.run(8)
+    boat, drones = fleet[0], list(fleet.living)
+    fleet.run(200)  # the fleet's time is older than any that begins anew
+    animal = 5 if command == operator_t.LEAVE else -1
+    assert boat.core.order(Order(boat.fleet_us, command, 0, animal, 6 * 3600), boat.now_us)
+    fleet.run(3)
+    for drone in drones:
+        drone.die()
+    fleet.run(240)
+    for drone in drones:
+        drone.clock = ClockError(20 * S - fleet.queue.now_us, 0)
+        drone.start()
+    fleet.run(20)
+    assert all(drone.state.fleet_time_ok for drone in drones)
+    assert all(drone.state.order.command == operator_t.NONE and not drone.state.left for drone in drones)
+    assert boat.core.order(Order(boat.fleet_us, operator_t.LAND, 0, -1, 60), boat.now_us)
+    assert boat.core.order(Order(boat.fleet_us, operator_t.LEAVE, 0, 5, 60), boat.now_us)
+    fleet.run(3)
+    assert all(drone.state.order.command == operator_t.LAND for drone in drones)
+    assert all(list(drone.state.left) == [5] for drone in drones)

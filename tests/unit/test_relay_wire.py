@@ -155,6 +155,21 @@ def test_more_orders_than_one_table_holds_all_arrive_in_turn() -> None:
     assert sink.left(1_000) == list(range(12))
 
 
+def test_orders_to_fly_go_before_those_about_animals_and_each_peer_has_its_own_turn() -> None:
+    source = FleetTable(1, (0, 1, 2, 3))
+    sinks = {peer: FleetTable(peer, (0, 1, 2, 3)) for peer in (2, 3)}
+    source.order(Order(1000, operator_t.HOLD, 3, -1, 60))
+    for animal in range(7):
+        source.order(Order(2000 + animal, operator_t.LEAVE, 0, animal, 60))
+    for peer, sink in sinks.items():
+        sink.merge(1, source.pack(peer, 1_000_000), 1_000_000)
+        assert sink.order_for(3, 3_000).command == operator_t.HOLD
+    for _ in range(3):  # two peers and an even number of the rest: one counter for both would starve each
+        for peer, sink in sinks.items():
+            sink.merge(1, source.pack(peer, 1_000_000), 1_000_000)
+    assert [sink.left(3_000) for sink in sinks.values()] == [list(range(7))] * 2
+
+
 def test_a_row_of_an_earlier_life_of_a_drones_clock_does_not_come_back() -> None:
     ids = (0, 1, 2, 3)
     old_life, new_life, sink = FleetTable(2, ids), FleetTable(2, ids), FleetTable(1, ids)

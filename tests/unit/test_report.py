@@ -430,3 +430,26 @@ def test_the_judges_reasons_become_plain_words(reason: str, words: str) -> None:
 def test_times_are_told_as_people_say_them() -> None:
     assert [clock(t_s) for t_s in (0, 94.4, 3725)] == ["0:00", "1:34", "1:02:05"]
     assert [lasting(t_s) for t_s in (8.2, 63, 120, 7500)] == ["8 s", "1 min 3 s", "2 min", "2 h 5 min"]
+
+
+class OddRun(MappedRun):
+    """Values that no drone should say, each of the right type."""
+
+    def _identities(self, drone: int, t_s: float) -> podwatch.identities_t:
+        named = super()._identities(drone, t_s)
+        for box in named.boxes[:1]:
+            box.left_px = float("nan")
+        for seen in named.map[:1]:
+            seen.size_m = float("nan")
+        return named
+
+    def _vehicle_state(self, drone: int, t_s: float) -> podwatch.vehicle_state_t:
+        state = super()._vehicle_state(drone, t_s)
+        state.utc_us = 2**62
+        return state
+
+
+def test_values_that_are_no_numbers_or_no_times_cost_the_page_nothing_else(tmp_path):
+    flight = read_flight([logs_only(tmp_path / "run", OddRun())])
+    page = write_report([flight], tmp_path / "page.html")
+    assert page.exists()

@@ -21,6 +21,7 @@ __all__ = ["boat"]
 
 LINK_LIMIT_S = 20.0
 OBEY_LIMIT_S = 8.0
+SAID_FOR_US = 1_500_000  # an order is sent again this long
 LINK_LINE_S = 1.0
 STATUS_S = 5.0
 REDRAW_S = 0.25
@@ -98,6 +99,8 @@ class _Loop:
 def _say_once(loop: _Loop, order: Spoken) -> None:
     given = _given(loop, order)
     typer.echo(f"said: {order}")
+    # One datagram may be lost, and what asks nothing of any drone is obeyed before it is heard.
+    loop.until(lambda: loop.now_us - given.at_us > SAID_FOR_US, OBEY_LIMIT_S)
     if not loop.until(lambda: not loop.core.left_to_obey(given, loop.now_us), OBEY_LIMIT_S):
         late = ", ".join(map(str, loop.core.left_to_obey(given, loop.now_us)))
         raise BoatError(

@@ -88,9 +88,11 @@ class Boat:
         state = self.state(now_us)
         if not self.is_linked(now_us):
             raise BoatError("no drone hears the boat yet: an order would reach nobody; wait for the link")
-        fleet_us = now_us + int(state.fleet_offset_us)
+        # The newest word counts, also where another boat's clock runs a little ahead.
+        fleet_us = max(now_us + int(state.fleet_offset_us), self._relay.fleet.newest_order_us() + 1)
         order = Order(fleet_us, spoken.command, spoken.target, spoken.animal, EXPIRY_S[spoken.command])
-        self._relay.order(order, now_us)
+        if not self._relay.order(order, now_us):
+            raise BoatError(f"{spoken}: the fleet keeps a newer order than this one; say it again")
         self.given.append(Given(spoken, order, now_us))
         return self.given[-1]
 

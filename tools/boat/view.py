@@ -57,7 +57,7 @@ def status_line(boat: Boat, now_us: int) -> str:
 
 def picture(boat: Boat, now_us: int, link: str, typed: str, said: str) -> RenderableType:
     """The whole view. link: of `link_line`, taken once a second. typed: the line so far."""
-    rows = boat.rows(now_us)
+    rows, left = boat.rows(now_us), list(boat.state(now_us).left)
     table = Table(box=box.SIMPLE_HEAD, show_edge=False, pad_edge=False, padding=(0, 2, 0, 0))
     for title in ("drone", "state"):
         table.add_column(title, no_wrap=True)
@@ -78,6 +78,7 @@ def picture(boat: Boat, now_us: int, link: str, typed: str, said: str) -> Render
             find_line(boat, now_us) or "no find yet", style="bold green" if find_line(boat, now_us) else "dim"
         ),
         table,
+        *([Text(f"left alone: animal {', '.join(map(str, left))}", style="cyan")] if left else []),
         *orders,
         Text(said, style="yellow"),
         Text(HELP, style="dim"),

@@ -17,6 +17,7 @@ from lcmtypes.podwatch import heartbeat_t, track_t, vehicle_state_t
 from logs.exceptions import LogError
 from logs.fleet import Fleet, FleetMessage, Report, find_logs
 from logs.sequence import read_head
+from procs.autopilot.telemetry import EARLIEST_UTC_US, LATEST_UTC_US
 from procs.navigator.states import State
 
 __all__ = ["AnimalSight", "DronePose", "Marks", "Note", "Outline", "Picture", "Recording", "colour_of"]
@@ -315,7 +316,7 @@ def _began(fleet: Fleet, begin_us: float) -> datetime | None:
     for entry in fleet.messages():
         if entry.raw.channel == channels.VEHICLE_STATE:
             state = vehicle_state_t.decode(entry.raw.data)
-            if state.utc_us:
+            if EARLIEST_UTC_US <= state.utc_us < LATEST_UTC_US:
                 after_us = fleet.lines[entry.drone_id].at(state.utime) - begin_us
                 return datetime.fromtimestamp((state.utc_us - after_us) / 1e6, tz=UTC)
     return None

@@ -21,6 +21,7 @@ from typing import Any
 from jinja2 import Environment, StrictUndefined
 
 from lcmtypes import channels
+from procs.autopilot.telemetry import EARLIEST_UTC_US, LATEST_UTC_US
 from tools.report import words
 from tools.report.events import Event, list_events
 from tools.report.findings import GRAVE, NOTE, Finding, find_findings, sentence
@@ -68,7 +69,7 @@ class Section:
         """Date and time by a drone's GPS, else as the run's folder is named by, empty where it is not."""
         for samples in self.flight.run.messages.values():
             for t_s, state in samples.get(channels.VEHICLE_STATE, ()):
-                if state.utc_us:
+                if EARLIEST_UTC_US <= state.utc_us < LATEST_UTC_US:
                     began = datetime.fromtimestamp(state.utc_us / 1e6 - t_s, tz=UTC)
                     return began.strftime("%-d %B %Y, %H:%M UTC")
         found = FOLDER_TIME.match(self.flight.name)

@@ -109,7 +109,8 @@ def _stills(flight: Flight, drone_id: int, previews: Sequence[tuple[float, Any]]
     named = _Nearest(flight.run.messages[drone_id][channels.IDENTITIES])
     tracks = _Nearest(flight.run.messages[drone_id][channels.TRACK])
     for t_s, preview in previews:
-        marks = tuple(_marks(flight, drone_id, preview, named.at(t_s), tracks.at(t_s)))
+        found = _marks(flight, drone_id, preview, named.at(t_s), tracks.at(t_s))
+        marks = tuple(mark for mark in found if np.isfinite([mark.x, mark.y, mark.width, mark.height]).all())
         yield Still(t_s, drone_id, preview.width, preview.height, bytes(preview.data), marks)
 
 

@@ -82,7 +82,10 @@ def _believed_animals(flight: Flight, t_s: Array) -> tuple[dict[int, Array], dic
     for log in flight.run.drones:
         for at_s, named in flight.run.messages[log.id][channels.IDENTITIES]:
             for seen in named.map:
-                if seen.age_ms > OLDEST_SIGHT_S * 1000 or not np.isfinite([seen.n_m, seen.e_m]).all():
+                if (
+                    seen.age_ms > OLDEST_SIGHT_S * 1000
+                    or not np.isfinite([seen.n_m, seen.e_m, seen.size_m]).all()
+                ):
                     continue
                 rank = (seen.age_ms, seen.residual_m)
                 slot = best.setdefault(seen.id, {})
