@@ -24,7 +24,7 @@ class State(IntEnum):
     MONITOR = 8  # keeps its animal in view
     RETURN = 9
     LANDED = 10
-    HOLD = 11  # in doubt: stays where it is
+    HOLD = 11  # in doubt, or as ordered: stays where it is
     LAND = 12  # comes down where it is
 
 
@@ -71,12 +71,12 @@ class Event(Enum):
     ORDER_LAND = "ordered to land"
     BOAT_LOST = "the boat is silent"
     HELD_TOO_LONG = "held too long"
-    TO_STANDBY = "doubt over: stands by"
-    TO_SCOUT = "doubt over: scouts on"
-    TO_RENDEZVOUS = "doubt over: gathers"
-    TO_MONITOR = "doubt over: watches its animal again"
-    TO_RETURN = "doubt over: returns on"
-    TO_LAND = "doubt over: lands on"
+    TO_STANDBY = "holds no more: stands by"
+    TO_SCOUT = "holds no more: scouts on"
+    TO_RENDEZVOUS = "holds no more: gathers"
+    TO_MONITOR = "holds no more: watches its animal again"
+    TO_RETURN = "holds no more: returns on"
+    TO_LAND = "holds no more: lands on"
 
 
 S, E = State, Event

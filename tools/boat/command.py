@@ -35,9 +35,12 @@ def boat(
     ] = "",
     status: Annotated[bool, typer.Option("--status", help="Say once how the fleet is, and end.")] = False,
 ) -> None:
-    """See the find, every drone and its animal; type orders: start, hold, return, land, leave."""
+    """See the find, every drone and its animal; type orders: start, hold, return, land, leave,
+    watch.
+    """
     from procs.bus_executor import DEFAULT_CLOCK, load_driver
     from procs.relay.keys import read_key
+    from procs.runtime import RuntimeFailure
     from tools.boat.core import Boat
     from tools.fleet.machine import boat_radio, read_fleet
 
@@ -46,7 +49,10 @@ def boat(
         key = read_key(Path(mission.radio.key_file))
         order = parse(say, mission.roster) if say else None
         clock = load_driver(mission.boat.drivers.get("clock", DEFAULT_CLOCK))
-        radio = load_driver(boat_radio(mission))
+        try:
+            radio = load_driver(boat_radio(mission))
+        except RuntimeFailure as error:
+            raise BoatError(f"{error}; is another `podwatch boat` open here? Type the order there") from error
         with contextlib.closing(radio):
             loop = _Loop(Boat(mission, key, radio, clock.utime()), radio, clock)
             try:
@@ -136,28 +142,34 @@ def _from_a_pipe(loop: _Loop) -> None:
     from tools.boat.view import status_line
 
     _link(loop)
-    shown, due_s = "", 0.0
+    shown, due_s, n_refused = "", 0.0, 0
     while True:
         if loop.turn(sys.stdin):
             line = sys.stdin.readline()
             if not line or line.strip() == "quit":
+                if n_refused:
+                    raise OrderError(f"orders that were not given: {n_refused}; each is told above")
                 return
             if line.strip():
-                typer.echo(_answer(loop, line))
+                is_given, told = _answer(loop, line)
+                n_refused += not is_given
+                typer.echo(told)
         now = status_line(loop.core, loop.now_us)
         if now != shown or time.monotonic() >= due_s:
             shown, due_s = now, time.monotonic() + STATUS_S
             typer.echo(now)
 
 
-def _answer(loop: _Loop, line: str) -> str:
-    """Give the order in a line -> what is told of it."""
+def _answer(loop: _Loop, line: str) -> tuple[bool, str]:
+    """Give the order in a line -> (whether it was given, what is told of it)."""
     try:
         order = parse(line, loop.core.mission.roster)
+        watched = [row.animal for row in loop.core.rows(loop.now_us).values()]
         loop.core.say(order, loop.now_us)
     except (OrderError, BoatError) as error:
-        return str(error)
-    return f"said: {order}"
+        return False, str(error)
+    nobody = order.animal >= 0 and order.animal not in watched
+    return True, f"said: {order}" + (f" (nobody watches animal {order.animal} now)" if nobody else "")
 
 
 def _at_the_terminal(loop: _Loop) -> None:
@@ -177,7 +189,7 @@ def _at_the_terminal(loop: _Loop) -> None:
                 if key in ("\n", "\r"):
                     if typed.strip() == "quit":
                         return
-                    said, typed = _answer(loop, typed) if typed.strip() else "", ""
+                    said, typed = _answer(loop, typed)[1] if typed.strip() else "", ""
                 elif key in ("\x7f", "\b"):
                     typed = typed[:-1]
                 elif key.isprintable():

@@ -44,6 +44,7 @@ class Boat:
         """
         self.mission = mission
         self.given: list[Given] = []
+        self._find: fleet_row_t | None = None
         self._radio = radio
         self._relay = Relay(
             own_id=BOAT_ID,
@@ -73,6 +74,12 @@ class Boat:
     def rows(self, now_us: int) -> dict[int, fleet_row_t]:
         """The drones that were ever heard of, by id."""
         return {row.id: row for row in self.state(now_us).rows if row.id != BOAT_ID}
+
+    def find(self, now_us: int) -> fleet_row_t | None:
+        """The row that says where the pod was found; kept when the fleet has gone home."""
+        saying = [row for row in self.rows(now_us).values() if row.found]
+        self._find = saying[0] if saying else self._find
+        return self._find
 
     def links(self, now_us: int) -> list[link_t]:
         """The boat's own links to drones; begins a new second of counting their bytes."""

@@ -32,16 +32,15 @@ def link_line(boat: Boat, now_us: int) -> str:
 
 def find_line(boat: Boat, now_us: int) -> str:
     """Where the pod is, "" where none was found."""
-    rows = [row for row in boat.rows(now_us).values() if row.found]
-    if not rows:
+    row, origin = boat.find(now_us), boat.mission.origin
+    if row is None:
         return ""
-    row, origin = rows[0], boat.mission.origin
     latitude, longitude, _ = pymap3d.ned2geodetic(
         row.found_n_m, row.found_e_m, 0.0, origin.latitude_deg, origin.longitude_deg, origin.altitude_m
     )
     return (
         f"pod found at {latitude:.5f}, {longitude:.5f}: {row.found_n_m:.0f} m north, {row.found_e_m:.0f} m "
-        f"east, {row.pod_radius_m:.0f} m round"
+        f"east, {row.pod_radius_m:.0f} m from its middle to its edge"
     )
 
 

@@ -26,7 +26,8 @@ def report(
     out: Annotated[
         Path | None,
         typer.Option(
-            help="The page to write. [default: report.html in the mission's folder, or here for a day]",
+            help="The page to write. [default: report.html in the mission's folder, or here for a day; "
+            "logs_report.html beside logs that are given by name]",
             show_default=False,
         ),
     ] = None,
@@ -68,4 +69,6 @@ def _readable(found: list[list[Path]]) -> list["Flight"]:
 def _beside(found: list[list[Path]]) -> Path:
     """In the one mission's folder, that of its logs too; in the current folder where there are several."""
     folders = {path if path.is_dir() else path.parent for paths in found for path in paths}
-    return (folders.pop() if len(folders) == 1 else Path()) / "report.html"
+    # A few logs by name tell less than their run's own page, which stays as it is.
+    name = "report.html" if any(path.is_dir() for paths in found for path in paths) else "logs_report.html"
+    return (folders.pop() if len(folders) == 1 else Path()) / name

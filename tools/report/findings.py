@@ -66,7 +66,9 @@ def sentence(flight: Flight, watched: dict[int, list[Span]]) -> tuple[bool | Non
     if shared:
         return False, "Two drones watched the same animal for a time, by their own word."
     window = flight.verdict.monitor_window_s
-    together = f", all at the same time for {lasting(window[1] - window[0])}" if window else ""
+    # Where a log ends early, the window is that of the drones that are left.
+    is_whole = window is not None and not flight.cut_short
+    together = f", all at the same time for {lasting(window[1] - window[0])}" if window and is_whole else ""
     if n_watched == 1:
         return (
             None,

@@ -33,7 +33,7 @@ STATE_WORDS = {
     "RETURN": ("flies home", "#d5cbe6"),
     "LAND": ("lands", "#b9a9d6"),
     "LANDED": ("landed", "#f2f2f0"),
-    "HOLD": ("stopped in the air, in doubt", "#e58b88"),
+    "HOLD": ("stopped in the air", "#e58b88"),
 }
 UNKNOWN_STATE = ("in a state of another version", "#ffffff")
 PROCESS_WORDS = {

@@ -88,7 +88,7 @@ def _channel_line(
     is_slow = channel.is_slow(now_us, statistics.since_us)
     line.append(f"{rate_hz:>7.1f}", style=DOUBTFUL if is_slow else "")
     line.append(f"{channel.nominal_hz or '':>4.3g}" if channel.nominal_hz else f"{'':4}", style=FAINT)
-    line.append(f"{'-' if jitter_ms is None else f'{jitter_ms:.1f} ms':>8}")
+    line.append(f"{_jitter(jitter_ms):>8}")
     line.append(f"{_size(channel.bytes_s(now_us, statistics.since_us)):>9}")
     n_lost = channel.n_lost if channel.kind else None
     line.append(f"{'-' if n_lost is None else n_lost:>6}", style=BAD if n_lost else "")
@@ -152,6 +152,13 @@ def _link_lines(link: LinkRow, *, is_wide: bool) -> list[Text]:
     if is_wide or not kinds:
         return [line.append(f"  {', '.join(kinds)}", style=FAINT)]
     return [line, Text(f"{'':17}{', '.join(kinds)}", style=FAINT)]
+
+
+def _jitter(jitter_ms: float | None) -> str:
+    """Always within its column: from a tenth of a second on, seconds."""
+    if jitter_ms is None:
+        return "-"
+    return f"{jitter_ms:.1f} ms" if jitter_ms < 99.95 else f"{jitter_ms / 1000:.1f} s"
 
 
 def _size(n_bytes: float) -> str:
