@@ -195,3 +195,36 @@ def test_what_spying_costs_is_measured_beside_a_handler_of_lcm_that_does_nothing
     spy, handler, ratio = spy_rows(1.0)
     assert min(spy.n, handler.n) > 0
     assert float(ratio.figure or "nan") > 0
+
+
+def test_the_screen_is_drawn_and_its_keys_work(url):
+    """A terminal of its own: the channels, the newest message of a chosen one, the ring, the end."""
+    ours, theirs = pty.openpty()
+    command = [sys.executable, "-c", "from tools.cli import main; main()", "spy", "--url", url]
+    environment = {**os.environ, "TERM": "xterm", "COLUMNS": "120", "LINES": "40"}
+    with saying(url):
+        spy = subprocess.Popen(command, stdin=theirs, stdout=theirs, stderr=theirs, env=environment)
+        os.close(theirs)
+        for wanted, key in (("TRACK", b"j"), ("track_t, ", b"r"), ("members as each drone", b"q")):
+            _read_until(ours, wanted)
+            os.write(ours, key)
+        while _read(ours):
+            pass
+        assert spy.wait(DEADLINE_S) == 0
+    os.close(ours)
+
+
+def _read_until(terminal: int, wanted: str) -> None:
+    seen, ends_s = "", time.monotonic() + DEADLINE_S
+    while wanted not in seen:
+        assert time.monotonic() < ends_s, f"{wanted!r} was not drawn; what was: {seen[-2000:]!r}"
+        seen += _read(terminal)
+
+
+def _read(terminal: int) -> str:
+    """What the terminal shows next; "" once its program has ended."""
+    ready, _, _ = select.select([terminal], [], [], 1.0)
+    try:
+        return os.read(terminal, 65536).decode(errors="replace") if ready else " "
+    except OSError:
+        return ""
