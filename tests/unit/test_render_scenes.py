@@ -1,6 +1,7 @@
 """Labelled scenes: truth that fits the picture, the rule of what counts, and the files that are written."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -22,6 +23,7 @@ from drivers.sim.render.effects import (
 from drivers.sim.render.species import species_named
 from tools.render import SPLITS, Scene, measured_right_whales, render_dataset, scenes
 from tools.render.pods import varied
+from tools.render.scenes import _place
 from tools.render.visible import LEAST_CONTRAST, LEAST_LONG_SHARE, draw_and_see
 from tools.train.detector.samples import read_yolo
 
@@ -143,6 +145,15 @@ def test_a_box_ends_where_the_animal_fades_under_water() -> None:
     assert sunk[1] == pytest.approx(whole[1], abs=1)  # the head, to the north, is as it was
     length = whole[3] - whole[1]
     assert 0.2 * length < whole[3] - sunk[3] < 0.6 * length
+
+
+def test_a_poster_shows_the_whole_animal() -> None:
+    lawns = replace(SPLITS["val"], posters=1.0)
+    for seed in range(6):
+        place = _place(np.random.default_rng(seed), lawns, seed, None, ())
+        assert place.kind == "grass"
+        assert place.species is not None
+        assert place.species.head_under == place.species.tail_under == 0
 
 
 def test_an_animal_under_another_shows_only_what_is_not_covered() -> None:

@@ -5,7 +5,7 @@ alone.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -123,6 +123,8 @@ def _place(
     sea = seas[int(rng.integers(len(seas)))] if seas else None
     grass = sea is None and rng.random() < split.posters
     species = pick_species(rng, split)
+    if grass and species is not None:  # a print shows the whole animal
+        species = replace(species, head_under=0.0, tail_under=0.0)
     if shapes and species is not None and species.name == "right" and rng.random() < 0.8:
         species = shapes[int(rng.integers(len(shapes)))]
     conditions = Conditions(sea_state=float(5 * rng.random() ** 1.5), glint=float(rng.uniform(0, 1) ** 1.5))
@@ -160,15 +162,11 @@ def _cut(sea: Image, rng: np.random.Generator, side: tuple[int, int]) -> Image:
 def _conditions(rng: np.random.Generator, place: _Place, camera_effects: bool) -> Conditions:
     sea = place.kind == "sea"
     glitter = float(rng.uniform(0.1, 0.8)) if sea and rng.random() < 0.2 else 0.0
-    base = Conditions(
-        place.conditions.sea_state if sea else 0.0, place.conditions.glint if sea else 0.0, glitter
-    )
+    base = replace(place.conditions, glitter=glitter) if sea else Conditions()
     if not camera_effects:
         return base
-    return Conditions(
-        base.sea_state,
-        base.glint,
-        glitter,
+    return replace(
+        base,
         haze=float(rng.uniform(0, 0.35)) if rng.random() < 0.2 else 0.0,
         exposure=float(rng.uniform(0.7, 1.25)),
         blur_px=float(rng.uniform(0.3, 1.1)) if rng.random() < 0.2 else 0.0,

@@ -1,13 +1,17 @@
 """Where the trainer's pictures come from, and how a batch of one step is put together from them."""
 
+import os
 from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from multiprocessing import get_context
 from pathlib import Path
 
 import cv2
 import numpy as np
 import torch
 
+from drivers.sim.render import Image
 from tools.train.detector.photographs import empty_seas, photograph_sample
 from tools.train.detector.samples import (
     WITH_EXTRAS,
@@ -24,7 +28,7 @@ from tools.train.detector.samples import (
 __all__ = ["Batches", "Mixture", "own_pictures", "photographs"]
 
 ENDLESS = 100_000_000  # batches; the trainer stops before
-SCENES_A_FILE = 1000  # rendered at a time: a killed run loses no more
+SCENES_A_FILE = 500  # rendered at a time: a killed run loses no more
 
 
 @dataclass(frozen=True)
@@ -47,15 +51,9 @@ class Batches(torch.utils.data.Dataset[tuple[torch.Tensor, list[torch.Tensor]]])
     """Batch number k: images (B, side, side, 3) uint8 RGB, and (N, 5) boxes an image; of (seed, k) alone."""
 
     def __init__(self, mixture: Mixture, cache: Path, data: Path | None, steps: int = ENDLESS) -> None:
-        outlines = real_data() / "whale_outlines" / "outlines.csv"
         self.mixture, self.steps = mixture, steps
         self.photographs = photographs()
-        self.rendered: list[Sample] = []
-        seas = empty_seas([photo for photo in self.photographs if photo.name not in WITH_EXTRAS])
-        for count, surfaces in ((mixture.scenes, []), (mixture.scenes_on_photographs if seas else 0, seas)):
-            for start in range(0, count, SCENES_A_FILE):
-                some, seed = min(SCENES_A_FILE, count - start), mixture.scenes_seed + start // SCENES_A_FILE
-                self.rendered += cached_scenes(cache, some, seed, "train", outlines, surfaces)
+        self.rendered = _rendered(cache, mixture, has_seas=bool(_seas(self.photographs)))
         self.empty = [sample for sample in self.rendered if len(sample.boxes) == 0]
         self.own = own_pictures(data) if data is not None else []
 
@@ -83,6 +81,39 @@ class Batches(torch.utils.data.Dataset[tuple[torch.Tensor, list[torch.Tensor]]])
             return photograph_sample(self.photographs, self.empty, rng, m.side)
         pool = self.empty if self.empty and rng.random() < m.empty_share else self.rendered
         return scene_sample(pool[int(rng.integers(len(pool)))], rng, m.side)
+
+
+def _rendered(cache: Path, mixture: Mixture, has_seas: bool) -> list[Sample]:
+    """All rendered scenes; those that are not in the cache are made on all processors."""
+    chunks = [
+        (min(SCENES_A_FILE, count - start), mixture.scenes_seed + start // SCENES_A_FILE, on_photographs)
+        for count, on_photographs in (
+            (mixture.scenes, False),
+            (mixture.scenes_on_photographs * has_seas, True),
+        )
+        for start in range(0, count, SCENES_A_FILE)
+    ]
+    if len(chunks) > 1:
+        # New processes, not copies of this one: it may have threads, which do not survive copying.
+        with ProcessPoolExecutor(os.cpu_count(), mp_context=get_context("spawn")) as pool:
+            list(pool.map(_make_chunk, [cache] * len(chunks), chunks))
+    return [sample for chunk in chunks for sample in _chunk(cache, *chunk)]
+
+
+def _make_chunk(cache: Path, chunk: tuple[int, int, bool]) -> None:
+    cv2.setNumThreads(1)
+    _chunk(cache, *chunk)
+
+
+def _chunk(cache: Path, count: int, seed: int, on_photographs: bool) -> list[Sample]:
+    outlines = real_data() / "whale_outlines" / "outlines.csv"
+    seas = _seas(photographs()) if on_photographs else []
+    return cached_scenes(cache, count, seed, "train", outlines, seas)
+
+
+def _seas(photos: Sequence[Sample]) -> list[Image]:
+    """Empty water of those photographs that show no animal without a box."""
+    return empty_seas([photo for photo in photos if photo.name not in WITH_EXTRAS])
 
 
 def photographs() -> list[Sample]:

@@ -39,6 +39,7 @@ class Settings:
     minutes: float | None = None  # of running time, in place of steps: the rate then follows the clock
     width: float = 1.0  # of the network: its channels times this
     rate: float = 2e-3  # the highest that never diverged with AdamW on this network
+    rate_from: float = 1e-3  # with weights that know something already
     last_rate_share: float = 0.01  # a cosine down to this settles the boxes
     warmup_steps: int = 300  # assignment is random before the boxes mean anything
     weight_decay: float = 0.03  # the photographs are few
@@ -71,7 +72,7 @@ class _Run:
         ]
         self.optimiser = torch.optim.AdamW(groups, lr=settings.rate)
         self.average = {name: value.clone() for name, value in self.network.state_dict().items()}
-        self.step, self.seconds = 0, 0.0
+        self.step, self.seconds, self.highest_rate = 0, 0.0, settings.rate
 
     def save(self, path: Path, settings: Settings) -> None:
         """Whole or not at all: a kill while writing keeps the last one."""
@@ -81,6 +82,7 @@ class _Run:
             "optimiser": self.optimiser.state_dict(),
             "step": self.step,
             "seconds": self.seconds,
+            "highest_rate": self.highest_rate,
             "width": settings.width,
             "settings": {name: str(value) for name, value in asdict(settings).items()},
         }
@@ -100,10 +102,12 @@ class _Run:
         self.network.load_state_dict(state["network"])
         self.optimiser.load_state_dict(state["optimiser"])
         self.average, self.step, self.seconds = state["average"], state["step"], state["seconds"]
+        self.highest_rate = state["highest_rate"]
 
-    def begin_from(self, weights: Path) -> None:
+    def begin_from(self, weights: Path, rate: float) -> None:
         """Take the weights of an exported model or of a checkpoint's running mean, and begin at step 0."""
         load_weights(self.network, weights)
+        self.highest_rate = rate
         self.average = {name: value.clone() for name, value in self.network.state_dict().items()}
 
     def progress(self, settings: Settings) -> float:
@@ -156,7 +160,7 @@ def train(
         run.load(checkpoint, settings)
         print(f"goes on at step {run.step}, {run.progress(settings):.0%} of the training", flush=True)
     elif begin_from is not None:
-        run.begin_from(begin_from)
+        run.begin_from(begin_from, settings.rate_from)
         print(f"begins from {begin_from}", flush=True)
     run.network.train()
     sums, begun = np.zeros(2), time.monotonic() - run.seconds
@@ -186,9 +190,9 @@ def _from(batches: Batches, step: int, workers: int) -> Iterator[tuple[Tensor, l
     yield from loader
 
 
-def _rate(settings: Settings, step: int, progress: float) -> float:
+def _rate(settings: Settings, rate: float, step: int, progress: float) -> float:
     low = settings.last_rate_share
-    cosine = settings.rate * (low + (1 - low) * 0.5 * (1 + float(np.cos(np.pi * progress))))
+    cosine = rate * (low + (1 - low) * 0.5 * (1 + float(np.cos(np.pi * progress))))
     return cosine * min((step + 1) / settings.warmup_steps, 1.0)
 
 
@@ -196,7 +200,7 @@ def _step(run: _Run, settings: Settings, images: Tensor, boxes: list[Tensor]) ->
     """One step of the optimiser on images (B, side, side, 3) uint8; returns (score loss, box loss)."""
     progress = run.progress(settings)
     for group in run.optimiser.param_groups:
-        group["lr"] = _rate(settings, run.step, progress)
+        group["lr"] = _rate(settings, run.highest_rate, run.step, progress)
     side = settings.early_side if progress < settings.early_share else settings.pictures.side
     pixels = images.to(run.device).permute(0, 3, 1, 2).float().div(255)  # (B, 3, H, W), channels last
     if side != pixels.shape[-1]:
@@ -231,7 +235,7 @@ def _short_floats_are_fast(device: torch.device) -> bool:
 
 def _report(run: _Run, settings: Settings, losses: NDArray[np.float64], log: Path) -> None:
     progress = run.progress(settings)
-    rate = _rate(settings, run.step, progress)
+    rate = _rate(settings, run.highest_rate, run.step, progress)
     line = f"{run.step},{losses[0]:.4f},{losses[1]:.4f},{rate:.6f},{run.seconds:.0f},{progress:.4f}"
     print(f"step,score_loss,box_loss,rate,seconds,progress {line}", flush=True)
     with log.open("a") as file:
