@@ -34,6 +34,7 @@ os.dup2(int(sys.argv[2]), 4)
 os.execvp(sys.argv[3], sys.argv[3:])
 """
 LEAST_FREE = 10  # so that renumbering overwrites neither pipe
+BECOMES_S = 20.0
 
 
 def find_chromium() -> str | None:
@@ -75,6 +76,14 @@ class Page:
         said = self.call("Runtime.evaluate", expression=expression, awaitPromise=True, returnByValue=True)
         assert "exceptionDetails" not in said, said["exceptionDetails"]
         return said["result"].get("value")
+
+    def becomes(self, condition: str) -> bool:
+        """Whether a JavaScript condition comes true: what a click does may be seen a frame later."""
+        deadline = time.monotonic() + BECOMES_S
+        while not self.run(condition):
+            if time.monotonic() > deadline:
+                return False
+        return True
 
     def key(self, name: str) -> None:
         for kind in ("keyDown", "keyUp"):
