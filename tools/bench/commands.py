@@ -32,13 +32,14 @@ def bench_detection(
     seed: Annotated[int, typer.Option(min=0, help="Of the rendered scenes.")] = 1,
     out: Annotated[Path, typer.Option(help="Folder for the table and the figures.")] = Path("runs/bench"),
     model: Annotated[Path | None, typer.Option(help="Another ONNX file than the one that ships.")] = None,
+    scenes: Annotated[int | None, typer.Option(min=1, help="At most so many a set.")] = None,
     quick: Annotated[bool, typer.Option("--quick", help="Few scenes a set.")] = False,
 ) -> None:
     """Recall, precision, counts, false alarms and time on rendered scenes and held-out photographs."""
-    from tools.bench.detection import command
+    from tools.bench.detection import FRAMES, QUICK, command
 
     with plain_errors():
-        command(seed, out, quick=quick, model=model)
+        command(seed, out, most=scenes or (QUICK if quick else FRAMES), model=model)
 
 
 @bench.command("registration")

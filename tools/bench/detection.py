@@ -24,13 +24,13 @@ from tools.bench.detection_measure import (
 )
 from tools.bench.table import Row, bench_console, measured, print_table, write_table
 
-__all__ = ["Measures", "command", "sets"]
+__all__ = ["FRAMES", "QUICK", "Measures", "available", "command", "sets"]
 
 FRAMES = 1407  # as many as the paper has
 COUNT_SCENES = 200
 COUNTS = range(1, 11)
 EMPTY_SCENES = 500
-QUICK = 24  # scenes a set
+QUICK = 24  # scenes a set, for a look
 FILES = {"ours": "detector.onnx", "half width": "detector_half.onnx", "int8": "detector_int8.onnx"}
 # The paper's Table 1: overall accuracy, false positive and false negative rate, %.
 PAPER = {
@@ -47,7 +47,7 @@ class Measures:
     """What the rows and the figures are made of; filled set by set."""
 
     seed: int
-    quick: bool = False
+    most: int = FRAMES  # scenes a set
     paths: dict[str, Path] = field(default_factory=dict)  # by model
     frames: dict[str, Tally] = field(default_factory=dict)  # by model
     counts: dict[int, Tally] = field(default_factory=dict)  # by number of animals, ours
@@ -57,7 +57,7 @@ class Measures:
         return {"ours": open_detector(self.paths["ours"])}
 
     def scenes(self, full: int) -> int:
-        return min(full, QUICK) if self.quick else full
+        return min(full, self.most)
 
 
 def available(model: Path | None = None) -> dict[str, Path]:
@@ -120,7 +120,7 @@ def paper_rows() -> Iterator[Row]:
 def _count_rows(m: Measures) -> Iterator[Row]:
     """Exact counts of one to ten animals."""
     n, ours = m.scenes(COUNT_SCENES), m.ours
-    for animals in (1, 5, 10) if m.quick else COUNTS:
+    for animals in COUNTS if m.most > QUICK else (1, 5, 10):
         m.counts[animals] = look(ours, rendered(n, m.seed, "val", animals))["ours"]
         shares = [m.counts[animals].exact_share(confidence) for confidence in CONFIDENCES]
         floor, aim = {5: ("90 %", ""), 10: ("", "95 %")}.get(animals, ("", ""))
@@ -179,15 +179,15 @@ def sets(m: Measures) -> list[tuple[str, Callable[[], Iterator[Row]]]]:
 
 
 def command(
-    seed: int, out: Path, *, quick: bool, model: Path | None = None, draw_into: Path | None = None
+    seed: int, out: Path, *, most: int = FRAMES, model: Path | None = None, draw_into: Path | None = None
 ) -> None:
     """Measure all, print the table, write bench_detection.json and the figures.
 
-    quick: few scenes a set, for a look and for tests. model: another ONNX file than the one that ships.
+    most: scenes a set, of those that the bars ask for. model: another ONNX file than the one that ships.
     draw_into: folder of the figures, `out` where None.
     """
     console = bench_console()
-    m = Measures(seed, quick, available(model))
+    m = Measures(seed, most, available(model))
     rows: list[Row] = []
     for name, measure in sets(m):
         with console.status(name):
