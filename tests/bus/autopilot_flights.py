@@ -89,11 +89,24 @@ class Pilot:
         return message
 
 
-def there_and_back(pilot: Pilot, *, ready_s: float) -> None:
-    """Up to 15 m, 20 m north, and down again."""
+FLOWN_M = [20.0, 0.0, -15.0, 20.0, 0.0, 0.0]
+FLOWN_WITHIN_M = 3.0  # GPS and barometer of a real autopilot
+
+
+def there_and_back(pilot: Pilot, *, ready_s: float) -> list[float]:
+    """Up to 15 m, 20 m north, and down there -> (north, east, down) in m from the start, of the place aloft
+    and then of the end. FLOWN_M is what was asked.
+    """
+
+    def moved() -> list[float]:
+        state = pilot.state
+        return [state["n_m"] - home_n, state["e_m"] - home_e, state["d_m"] - home_d]
+
     pilot.fly_until(lambda: pilot.state["position_ok"], ready_s)
-    home_n, home_e = pilot.state["n_m"], pilot.state["e_m"]
+    home_n, home_e, home_d = pilot.state["n_m"], pilot.state["e_m"], pilot.state["d_m"]
     pilot.fly_until(lambda: pilot.state["d_m"] < -14, ready_s + 60, kind=setpoint_t.TAKEOFF, d_m=-15.0)
     goal = {"n_m": home_n + 20.0, "e_m": home_e, "d_m": -15.0}
     pilot.fly_until(lambda: abs(pilot.state["n_m"] - goal["n_m"]) < 1.0, 60, kind=setpoint_t.GOTO, **goal)
+    aloft = moved()
     pilot.fly_until(lambda: pilot.state["landed"] and not pilot.state["armed"], 120, kind=setpoint_t.LAND)
+    return aloft + moved()

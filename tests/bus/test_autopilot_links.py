@@ -19,7 +19,7 @@ from lcmtypes import channels, make
 from lcmtypes.podwatch import setpoint_t, vehicle_state_t
 from procs.autopilot.bridge import Bridge
 from procs.settings import DriverSpec, DroneSettings, Mission
-from tests.bus.autopilot_flights import Pilot, start_twin, there_and_back
+from tests.bus.autopilot_flights import FLOWN_M, FLOWN_WITHIN_M, Pilot, start_twin, there_and_back
 
 ROOT = Path(__file__).parents[2]
 DEADLINE_S = 60.0
@@ -42,7 +42,8 @@ def test_a_flight_over_udp_to_another_process(link):
     twin = start_twin(f"udpout:127.0.0.1:{link.port}", scale=SCALE, system_id=3)
     try:
         mission = Mission(drones=[{"id": 3}])
-        there_and_back(Pilot(Bridge(mission, 3), link, drone_id=3, scale=SCALE), ready_s=200)
+        flown_m = there_and_back(Pilot(Bridge(mission, 3), link, drone_id=3, scale=SCALE), ready_s=200)
+        assert flown_m == pytest.approx(FLOWN_M, abs=FLOWN_WITHIN_M)
     finally:
         end(twin)
 
@@ -54,8 +55,11 @@ def test_an_autopilot_that_dies_and_comes_back_is_taken_up_again(link):
         pilot.fly_until(lambda: pilot.state["position_ok"], 200)
         end(twin)
         pilot.fly_until(lambda: not pilot.state["position_ok"] and pilot.state["link_age_ms"] > 3000, 30)
+        assert pilot.bridge.problem(pilot.utime), "a bridge without an autopilot says so"
         twin = start_twin(f"udpout:127.0.0.1:{link.port}", scale=SCALE, system_id=1)  # from another port
         pilot.fly_until(lambda: pilot.state["position_ok"], 200)
+        assert pilot.state["link_age_ms"] < 3000
+        assert pilot.state["landed"]
     finally:
         end(twin)
 

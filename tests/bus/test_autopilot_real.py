@@ -8,7 +8,7 @@ from drivers.autopilots.ardupilot import Codec
 from drivers.autopilots.mavlink_link import open_link
 from procs.autopilot.bridge import Bridge
 from procs.settings import Mission
-from tests.bus.autopilot_flights import Pilot, there_and_back
+from tests.bus.autopilot_flights import FLOWN_M, FLOWN_WITHIN_M, Pilot, there_and_back
 
 ADDRESSES = [
     address.strip() for address in os.environ.get("PODWATCH_AUTOPILOT", "").split(",") if address.strip()
@@ -44,6 +44,7 @@ def test_a_flight_on_a_real_autopilot(address):
             "altitude_m": where.altitude * 1e-3,
         }
         pilot = Pilot(Bridge(Mission(origin=origin), 1, target_system=system_id), link, drone_id=1)
-        there_and_back(pilot, ready_s=READY_S)
+        flown_m = there_and_back(pilot, ready_s=READY_S)
+        assert flown_m == pytest.approx(FLOWN_M, abs=FLOWN_WITHIN_M)
     finally:
         link.close()

@@ -148,6 +148,9 @@ def test_one_that_is_killed_is_started_again(flight):
     first = flight.beats["navigator"].pid
     os.kill(first, signal.SIGKILL)
     flight.await_that(lambda: flight.beats["navigator"].pid != first, READY_S)
+    assert not psutil.pid_exists(first)
+    assert psutil.Process(flight.beats["navigator"].pid).is_running()
+    assert set(flight.beats) == set(processes.BY_NAME), "and nobody else is missing"
 
 
 def test_sigterm_ends_all_in_order_and_leaves_nothing(flight):

@@ -69,4 +69,9 @@ def test_what_a_process_starts_itself_does_not_speak_for_it(systemd, monkeypatch
 
 def test_without_systemd_nothing_is_said(monkeypatch):
     monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
-    Notifier().beat("ok")
+    opened: list[object] = []
+    monkeypatch.setattr(socket, "socket", lambda *kind: opened.append(kind))
+    notifier = Notifier()
+    notifier.beat("ok")
+    notifier.stopping()
+    assert opened == []
