@@ -1,9 +1,9 @@
 """The executor on a real bus: one process, one select loop, one LCM handle.
 
-Traps of lcm 1.5.3 that shape it: a signal during `handle()` raises OSError, so the loop waits in select and
-handles only what is there; the C queue drops the newest message when it is full, so it is made deep and
-drained at once into the runtime's own queues; an LCM made before a fork is broken, so it is made here, after
-the process has started.
+Traps of lcm 1.5.3 that shape it: a signal during `handle()` raises OSError, so the loop waits in select,
+handles only what is there, and looks again where a signal still fell into it; the C queue drops the newest
+message when it is full, so it is made deep and drained at once into the runtime's own queues; an LCM made
+before a fork is broken, so it is made here, after the process has started.
 """
 
 import importlib
@@ -27,6 +27,7 @@ ROUTE_COMMAND = "ip route replace 239.255.76.0/24 dev lo"
 
 # Deep enough for the longest handler: messages wait in C for as long as one handler runs.
 C_QUEUE_CAPACITY = 2000
+MOST_FAILED_TAKES = 100  # in a row: so many signals never fall into LCM's system calls
 LONGEST_WAIT_S = 0.5
 SELF_TEST = "LCM_SELF_TEST"  # what each new LCM says to itself, to see whether there is a route
 # A process that a stop signal finds inside a hung handler is ended by the kernel after this long.
@@ -73,6 +74,7 @@ class BusRuntime(Runtime):
         self._transports: list[tuple[Transport, Callable[[], None]]] = []
         self._ready: list[Any] = []
         self._raw: list[tuple[str, bytes]] = []
+        self._failed_takes = 0
         self._running = True
         self._notifier = Notifier()
         self._cpu_s = 0.0
@@ -189,13 +191,26 @@ class BusRuntime(Runtime):
         if self._wake_read in self._ready:
             os.read(self._wake_read, 1024)
         for _ in range(C_QUEUE_CAPACITY):  # a flood that never ends must not keep the timers waiting
-            if not self._running or self._lcm.handle_timeout(0) <= 0:
+            if not self._running or not self._take_from_lcm():
                 break
         if self._raw and self._raw_handler is not None:
             raw, self._raw = self._raw, []
             self._counts["handled"] += len(raw)
             for channel, data in raw:
                 self._raw_handler(channel, data, self._now)
+
+    def _take_from_lcm(self) -> bool:
+        """One message out of LCM's queue into ours; False where none waits, or a signal came between."""
+        try:
+            taken = self._lcm.handle_timeout(0) > 0
+        except OSError:
+            # A signal inside LCM's own system calls looks like this and loses nothing; a dead bus always does.
+            self._failed_takes += 1
+            if self._failed_takes > MOST_FAILED_TAKES:
+                raise
+            return False
+        self._failed_takes = 0
+        return taken
 
     def _read_transports(self) -> None:
         for transport, handler in self._transports:

@@ -105,6 +105,47 @@ def test_signals_by_the_hundred_between_messages_break_nothing(bench):
     assert bench.end() == (0, "")
 
 
+# LCM as it is when signals fall into it: it raises, N times out of each N + 1, and keeps what waits.
+INTERRUPTED = """
+class Interrupted:
+    def __init__(self, real):
+        self.real, self.failed = real, 0
+    def __getattr__(self, name):
+        return getattr(self.real, name)
+    def handle_timeout(self, limit):
+        self.failed = (self.failed + 1) % (FAILURES + 1)
+        if self.failed:
+            raise OSError("lcm_handle_timeout() returned -1")
+        return self.real.handle_timeout(limit)
+runtime._lcm = Interrupted(runtime._lcm)
+runtime.run()
+"""
+
+
+def test_a_signal_that_falls_into_lcm_loses_no_message(bench):
+    bench.start(
+        "-c", SHELL.replace("runtime.run()", INTERRUPTED.replace("FAILURES", "3")), "SETTINGS", "quick"
+    )
+    bench.await_that(lambda: bench.beats)
+    for _ in range(20):
+        say_track(bench)
+    bench.await_that(lambda: bench.setpoints.count(2) == 20)
+    os.kill(bench.process.pid, signal.SIGTERM)
+    assert bench.end() == (0, "")
+
+
+def test_a_bus_that_always_fails_ends_the_process(bench):
+    """Its supervisor starts it anew; going round for ever would look alive and hear nothing."""
+    bench.start(
+        "-c", SHELL.replace("runtime.run()", INTERRUPTED.replace("FAILURES", "1000")), "SETTINGS", "quick"
+    )
+    bench.await_that(lambda: bench.beats)
+    say_track(bench)
+    code, said = bench.end()
+    assert code == 1
+    assert "lcm_handle_timeout() returned -1" in said
+
+
 HARMLESS = """
 import signal
 signal.signal(signal.SIGUSR1, lambda *_: None)
