@@ -204,7 +204,7 @@ class BusRuntime(Runtime):
         try:
             taken = self._lcm.handle_timeout(0) > 0
         except OSError:
-            # A signal inside LCM's own system calls looks like this and loses nothing; a dead bus always does.
+            # A signal inside LCM's own system calls looks like this, and loses nothing; a dead bus lasts.
             self._failed_takes += 1
             if self._failed_takes > MOST_FAILED_TAKES:
                 raise
