@@ -38,7 +38,7 @@ class Mixture:
     seed: int = 0
     batch: int = 16  # the smallest whose normalisation statistics are steady; larger ones cost steps
     side: int = 320  # what the exported network takes
-    photograph_share: float = 0.35  # of the samples; the rest are rendered
+    photograph_share: float = 0.25  # of the samples; the rest are rendered
     own_share: float = 0.5  # of the samples are the user's own pictures, where there are any
     empty_share: float = 0.12  # of the rendered samples at least: boats and foam must not pass for whales
     letterbox_share: float = 0.4  # cameras are wide, the network's input is square
