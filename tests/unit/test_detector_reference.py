@@ -7,6 +7,7 @@ The second shrinks by sums of weighted pixels, keeps no buffer, and takes away d
 import math
 from collections.abc import Iterator
 from functools import cache
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -42,12 +43,25 @@ def interpolating(n_from: int, n_to: int) -> np.ndarray:
 
 
 @cache
-def shrinking(n_from: int, n_to: int, n_halves: int, halves_first: bool) -> np.ndarray:
-    """(n_to, n_from): the whole way of one side, as a sum of pixels with weights."""
-    whole = np.eye(n_from) if halves_first else interpolating(n_from, n_to * 2**n_halves)
+def steps(n_from: int, n_to: int, n_halves: int, halves_first: bool) -> list[np.ndarray]:
+    """One side's way from `n_from` to `n_to`: matrices, each row the weights of one new pixel."""
+    sides = [n_from] if halves_first else [n_from, n_to * 2**n_halves]
+    matrices = [interpolating(*pair) for pair in pairwise(sides)]
     for _ in range(n_halves):
-        whole = halving(len(whole)) @ whole
-    return (interpolating(len(whole), n_to) @ whole).astype(np.float32)
+        matrices.append(halving(sides[-1]))
+        sides.append(sides[-1] // 2)
+    return [*matrices, interpolating(sides[-1], n_to)]
+
+
+def shrunk(picture: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """The picture at `size`; whole grey levels after each step, as pixels are."""
+    ratios = [n_from / n_to for n_from, n_to in zip(picture.shape[1::-1], size, strict=True)]
+    n_halves = int(math.log2(min(ratios)))
+    halves_first = all(side % 2**n_halves == 0 for side in picture.shape[:2])
+    ways = (steps(n, to, n_halves, halves_first) for n, to in zip(picture.shape[1::-1], size, strict=True))
+    for across, down in zip(*ways, strict=True):
+        picture = np.floor(np.einsum("yv,vuc,xu->yxc", down, picture, across, optimize=True) + 0.5)
+    return picture
 
 
 def reference(session: onnxruntime.InferenceSession, picture: np.ndarray, side: int) -> list[Box]:
@@ -55,12 +69,7 @@ def reference(session: onnxruntime.InferenceSession, picture: np.ndarray, side: 
     height, width = picture.shape[:2]
     ratio = side / max(width, height)
     small_w, small_h = round(width * ratio), round(height * ratio)
-    n_halves = int(math.log2(min(width / small_w, height / small_h)))
-    first = width % 2**n_halves == 0 and height % 2**n_halves == 0
-    across, down = (shrinking(*sides, n_halves, first) for sides in ((width, small_w), (height, small_h)))
-    rows = (down @ picture.reshape(height, -1).astype(np.float32)).reshape(small_h, width, 3)
-    planes = rows.transpose(2, 0, 1).reshape(-1, width) @ across.T
-    small = np.rint(planes.reshape(3, small_h, small_w).transpose(1, 2, 0))
+    small = shrunk(picture, (small_w, small_h))
     left, top = (side - small_w) // 2, (side - small_h) // 2
     canvas = np.full((side, side, 3), 114.0)
     canvas[top : top + small_h, left : left + small_w] = small
