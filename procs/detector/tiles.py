@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from procs.detector.decode import Candidates
 
-__all__ = ["SeenLength", "Tile", "merge", "owned", "plan"]
+__all__ = ["LEAST_ANIMAL_PX", "SeenLength", "Tile", "merge", "owned", "plan"]
 
 OVERLAP = (
     0.25  # of a tile that its neighbour shows too; an animal up to half as long is whole where it counts

@@ -24,7 +24,7 @@ from drivers.sim.render.species import species_named
 from tools.render import SPLITS, Scene, measured_right_whales, render_dataset, scenes
 from tools.render.pods import varied
 from tools.render.scenes import _place
-from tools.render.visible import LEAST_CONTRAST, LEAST_LONG_SHARE, draw_and_see
+from tools.render.visible import LEAST_CONTRAST, draw_and_see
 from tools.train.detector.samples import read_yolo
 
 
@@ -105,7 +105,7 @@ def test_what_counts_obeys_the_rule_that_the_card_states(drawn: list[Scene]) -> 
     for scene in drawn:
         assert (scene.contrast >= LEAST_CONTRAST).all()
         long_px = (scene.boxes[:, 2:] - scene.boxes[:, :2]).max(axis=1, initial=0)
-        assert (long_px >= LEAST_LONG_SHARE * 320).all()
+        assert (long_px >= SPLITS["val"].least_long_px).all()  # px of 320, as wide as these pictures
 
 
 def test_no_validation_scene_shows_a_species_or_a_water_of_the_trainer() -> None:

@@ -16,7 +16,7 @@ __all__ = ["cells", "draw"]
 
 # What makes an animal hard to see: title, value, edges of the cells.
 HARDNESS: tuple[tuple[str, Callable[[Animal], float], tuple[float, ...]], ...] = (
-    ("long side in the input, px", lambda a: a.long_px, (12, 16, 24, 36, 60, 100, 320)),
+    ("long side in the input, px", lambda a: a.long_px, (16, 24, 36, 60, 100, 320)),
     ("depth of the back under water, m", lambda a: a.depth_m, (0, 0.01, 0.3, 0.7, 1.2, 2.0, 3.5)),
     ("contrast with the water, grey levels", lambda a: a.contrast, (10, 15, 20, 30, 45, 70, 255)),
     ("glare (sheen and glitter), 0 to 1", lambda a: a.glare, (0, 0.1, 0.25, 0.5, 0.75, 1.01)),

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from drivers.cameras.pinhole import Pinhole, Pose, apply_homography
 from drivers.sim.render import MORE_WATERS, WATERS, AnimalView, Species
 from drivers.sim.render.species import species_named
+from procs.detector.tiles import LEAST_ANIMAL_PX
 
 __all__ = ["POSTER_LENGTHS_M", "SPLITS", "Pod", "Split", "make_pod", "make_view", "pick_species", "varied"]
 
@@ -24,6 +25,9 @@ class Split:
     posters: float = 0.14  # share of lawns with posters, the paper's field test
     varied: float = 1.0  # how far bodies and colours stray from the tables
     clutter: float = 1.0
+    # An animal counts from this long side of its box on, in a network's input of 320 px: what is measured is
+    # what the detector is asked for (smaller ones are cut into tiles); it learns somewhat smaller ones too.
+    least_long_px: float = LEAST_ANIMAL_PX
 
 
 HELD_OUT_WATERS = ("lagoon", "pewter", "bottle", "ink")
@@ -31,7 +35,7 @@ _WATERS = tuple(name for name in [*WATERS, *MORE_WATERS] if name not in HELD_OUT
 _SPECIES = ("sperm", "sperm", "right", "humpback", "minke", "blue", "bowhead", "beluga", "orca", "pilot")
 # Validation species, waters and seeds never reach the trainer.
 SPLITS: dict[str, Split] = {
-    "train": Split(_SPECIES, _WATERS, 0),
+    "train": Split(_SPECIES, _WATERS, 0, least_long_px=12.0),
     "tune": Split(_SPECIES, _WATERS, 400_000_000),  # for choosing thresholds, never for training
     "val": Split(("gray", "fin", "sei"), HELD_OUT_WATERS, 500_000_000, varied=0.3),
     "val_sperm": Split(("sperm",), HELD_OUT_WATERS, 600_000_000, varied=0.3),

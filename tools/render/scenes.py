@@ -24,7 +24,7 @@ from drivers.sim.render.effects import (
     vignetted,
 )
 from tools.render.pods import POSTER_LENGTHS_M, SPLITS, Pod, Split, make_pod, make_view, pick_species
-from tools.render.visible import LEAST_CONTRAST, LEAST_LONG_SHARE, LEAST_SHARE, Visible, draw_and_see
+from tools.render.visible import LEAST_CONTRAST, LEAST_SHARE, Visible, draw_and_see
 
 __all__ = ["Conditions", "Scene", "scenes"]
 
@@ -32,6 +32,7 @@ Array = NDArray[np.float64]
 
 SCENES_A_SEA = 12  # a sea's textures take a third of a second to make, a view of it some milliseconds
 EMPTY_SHARE = 0.1
+INPUT_PX = 320  # of the network, for whose eyes animals are large or small
 TRIES = 2000  # for a scene with exactly as many animals as were asked for
 
 
@@ -211,7 +212,8 @@ def _scene(
     if place.kind == "sea":
         _breaths(image, rng, camera, pose, animals)
     image = _photographed(image, rng, conditions)
-    scene = _labelled(image, seen, animals, camera.image_to_ground(pose), pose.height_m, place, conditions)
+    to_ground = camera.image_to_ground(pose)
+    scene = _labelled(image, seen, animals, to_ground, pose.height_m, place, conditions, split.least_long_px)
     exact = len(scene.ids) == wanted and not len(scene.faint)
     return scene if wanted is None or exact else None
 
@@ -264,6 +266,7 @@ def _labelled(
     height_m: float,
     place: _Place,
     c: Conditions,
+    least_long_px: float,
 ) -> Scene:
     """The scene with its animals told apart into those that count and those too faint to."""
     clear = (1 - c.haze) * c.exposure
@@ -272,7 +275,7 @@ def _labelled(
     counts = (
         (seen.shares >= LEAST_SHARE)
         & (contrast >= np.maximum(LEAST_CONTRAST, noise))
-        & (long_px >= LEAST_LONG_SHARE * max(image.shape[:2]))
+        & (long_px >= least_long_px * max(image.shape[:2]) / INPUT_PX)
     )
     shows = long_px > 0
     return Scene(

@@ -11,14 +11,13 @@ from drivers.sim.render import AnimalView, Image, SeaRenderer, Species
 from drivers.sim.render.labels import body_to_ground, phase_index
 from drivers.sim.render.sprites import animal_ring
 
-__all__ = ["LEAST_CONTRAST", "LEAST_LONG_SHARE", "LEAST_SHARE", "Visible", "draw_and_see"]
+__all__ = ["LEAST_CONTRAST", "LEAST_SHARE", "Visible", "draw_and_see"]
 
 Array = NDArray[np.float64]
 
 # The rule: an animal counts where a person who draws boxes would mark it.
 LEAST_SHARE = 0.3  # of its outline lies inside the picture, uncovered, and differs from the water
 LEAST_CONTRAST = 10.0  # grey levels between what shows of it and the water, and as much as the waves' own
-LEAST_LONG_SHARE = 12 / 320  # long side of the box against the picture's: 12 px in the network's input
 # A pixel shows the animal where it changed by so much, in the colour that changed most, and by this share of
 # what the animal changes at its clearest: the rest is a fading tail that nobody would draw a box round.
 SEEN_LEVELS, SEEN_SHARE = 6.0, 0.25
