@@ -15,6 +15,7 @@ bench = typer.Typer(help="Measure, and print every figure with its bar.", no_arg
 @bench.command("fleet")
 def bench_fleet(
     seeds: Annotated[int, typer.Option(min=1, help="Default missions in lockstep.")] = 10,
+    seed: Annotated[int, typer.Option(min=0, help="Of the first of them, and of all else.")] = 1,
     out: Annotated[Path, typer.Option(help="Folder for the runs and the table.")] = Path("runs/bench"),
     quick: Annotated[
         bool, typer.Option("--quick", help="Boxes in place of pixels, no processes mode.")
@@ -24,7 +25,7 @@ def bench_fleet(
     from tools.bench.fleet import command
 
     with plain_errors():
-        command(seeds, out, quick=quick)
+        command(range(seed, seed + seeds), out, quick=quick)
 
 
 @bench.command("detection")
