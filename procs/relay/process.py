@@ -134,17 +134,7 @@ def setup(runtime: Runtime) -> None:
         raise RuntimeFailure(str(error)) from error
     try:
         radio = runtime.open("radio")
-        core = Relay(
-            own_id=runtime.drone_id,
-            roster=mission.roster,
-            fleet_key=fleet_key,
-            session=radio.session_id(),
-            send=radio.send,
-            reachable=radio.peers,
-            bytes_per_s=mission.radio.bytes_per_s,
-            lost_after_s=mission.radio.lost_after_s,
-            now_us=runtime.utime,
-        )
+        core = Relay.on_radio(radio, mission, runtime.drone_id, fleet_key, runtime.utime)
     except (ValueError, OSError) as error:
         raise RuntimeFailure(str(error)) from error
     shell = RelayShell(runtime, radio, core)

@@ -23,6 +23,7 @@ from procs.relay.members import BOAT_ID, Members, Neighbours
 from procs.relay.passing import PASSED_ON, EpisodeRoll
 from procs.relay.rows import Marker, Row
 from procs.relay.seal import MAX_OVERHEAD_BYTES, Refusal, RefusedError, Sessions
+from procs.settings import Mission
 
 __all__ = ["DATAGRAM_LIMIT_BYTES", "ENCODED_LIMIT_BYTES", "MAX_MEMBERS", "TICK_S", "Copy", "Relay"]
 
@@ -50,6 +51,24 @@ class Copy:
 
 class Relay:
     """One drone's end of all its links. All times in us of its own clock."""
+
+    @classmethod
+    def on_radio(cls, radio: Any, mission: Mission, own_id: int, fleet_key: bytes, now_us: int) -> "Relay":
+        """The relay of one member of a fleet, on a radio with the interface of `drivers.radios.udp.UdpRadio`.
+
+        Raises ValueError where the radio has no address for a drone of the roster.
+        """
+        return cls(
+            own_id=own_id,
+            roster=mission.roster,
+            fleet_key=fleet_key,
+            session=radio.session_id(),
+            send=radio.send,
+            reachable=radio.peers,
+            bytes_per_s=mission.radio.bytes_per_s,
+            lost_after_s=mission.radio.lost_after_s,
+            now_us=now_us,
+        )
 
     def __init__(
         self,

@@ -7,10 +7,10 @@ import select
 import socket
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import count
 
 import lcm
 import pytest
@@ -19,6 +19,7 @@ from typer.testing import CliRunner
 
 from lcmtypes import channels, make
 from lcmtypes.podwatch import fleet_row_t, fleet_state_t, link_state_t, link_t, preview_t, track_t
+from tests.talker import saying_again
 from tools.bench.bus import spy_rows
 from tools.cli import app
 from tools.spy.command import render
@@ -43,7 +44,7 @@ def track(seq: int) -> bytes:
 @contextmanager
 def saying(url: str) -> Iterator[None]:
     """A drone that says its tracks and what it knows of the ring, fifty times a second."""
-    done = threading.Event()
+    bus, seqs = lcm.LCM(url), count(1)
     rows = [make(fleet_row_t, id=member, alive=True, age_ms=100 * member) for member in (1, 2)]
     fleet = make(fleet_state_t, drone_id=1, members=3, n_rows=2, rows=rows, left_id=2, right_id=2)
     most = {"max_payload": [0], "max_encoded": [0], "max_datagram": [0]}
@@ -53,21 +54,13 @@ def saying(url: str) -> Iterator[None]:
     state = make(link_state_t, drone_id=1, n_links=1, links=[link])
 
     def say() -> None:
-        bus, seq = lcm.LCM(url), 0
-        while not done.wait(0.02):
-            seq += 1
-            bus.publish(channels.TRACK, track(seq))
-            bus.publish(channels.FLEET_STATE, fleet.encode())
-            bus.publish(channels.LINK_STATE, state.encode())
-            bus.publish("OF_NO_TABLE", b"what is this")
+        bus.publish(channels.TRACK, track(next(seqs)))
+        bus.publish(channels.FLEET_STATE, fleet.encode())
+        bus.publish(channels.LINK_STATE, state.encode())
+        bus.publish("OF_NO_TABLE", b"what is this")
 
-    talker = threading.Thread(target=say)
-    talker.start()
-    try:
+    with saying_again(say, 0.02):
         yield
-    finally:
-        done.set()
-        talker.join()
 
 
 def spied(*arguments: object) -> str:

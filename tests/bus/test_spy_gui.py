@@ -8,7 +8,6 @@ import os
 import shutil
 import socket
 import subprocess
-import threading
 import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -21,6 +20,7 @@ from typer.testing import CliRunner
 
 from lcmtypes import jar, podwatch
 from lcmtypes.jar import JAVA_FOLDER, JarError, build_jar
+from tests.talker import saying_again
 from tools.cli import app
 from tools.doctor.mend import as_root
 from tools.spy import gui
@@ -69,22 +69,10 @@ def screen() -> Iterator[str]:
 
 @contextmanager
 def saying_every_type(url: str) -> Iterator[None]:
-    done = threading.Event()
-
-    def say() -> None:
-        bus = lcm.LCM(url)
-        messages = {name: example(name).encode() for name in TYPES}
-        while not done.wait(0.1):
-            for name, data in messages.items():
-                bus.publish(name.upper(), data)
-
-    talker = threading.Thread(target=say)
-    talker.start()
-    try:
+    bus = lcm.LCM(url)
+    messages = {name.upper(): example(name).encode() for name in TYPES}
+    with saying_again(lambda: [bus.publish(*message) for message in messages.items()], 0.1):
         yield
-    finally:
-        done.set()
-        talker.join()
 
 
 def class_path(*files: Path) -> str:

@@ -5,7 +5,6 @@ import shutil
 import socket
 import subprocess
 import sys
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
@@ -16,6 +15,7 @@ import pytest
 from pymavlink.dialects.v20 import common
 from typer.testing import CliRunner
 
+from tests.talker import saying_again
 from tools import errors
 from tools.buses import N_SLOTS, bus_url, free_udp_ports
 from tools.cli import app
@@ -201,18 +201,11 @@ def test_an_autopilots_port_that_is_taken_and_a_silent_one_are_told(monkeypatch,
 @contextmanager
 def talking(data: bytes, port: int) -> Iterator[None]:
     """Somebody who says `data` to a port of this machine, again and again."""
-    done = threading.Event()
-
-    def talk() -> None:
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
-            while not done.wait(0.01):
-                out.sendto(data, ("127.0.0.1", port))
-
-    talker = threading.Thread(target=talk)
-    talker.start()
-    yield
-    done.set()
-    talker.join()
+    with (
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out,
+        saying_again(lambda: out.sendto(data, ("127.0.0.1", port)), 0.01),
+    ):
+        yield
 
 
 def test_an_autopilot_that_beats_is_well_and_noise_is_not():

@@ -46,17 +46,7 @@ class Boat:
         self.given: list[Given] = []
         self._find: fleet_row_t | None = None
         self._radio = radio
-        self._relay = Relay(
-            own_id=BOAT_ID,
-            roster=mission.roster,
-            fleet_key=fleet_key,
-            session=radio.session_id(),
-            send=radio.send,
-            reachable=radio.peers,
-            bytes_per_s=mission.radio.bytes_per_s,
-            lost_after_s=mission.radio.lost_after_s,
-            now_us=now_us,
-        )
+        self._relay = Relay.on_radio(radio, mission, BOAT_ID, fleet_key, now_us)
 
     def hear(self, now_us: int) -> None:
         """Take in all that waits on the radio."""
