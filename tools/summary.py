@@ -241,7 +241,7 @@ def _link_table(summary: Summary) -> Table:
         table.add_column(title, justify="left" if title == "link" else "right")
     for link in summary["links"]:
         table.add_row(
-            f"{link['from']} → {link['to']}",
+            f"{link['from']} → {link['to'] or 'boat'}",
             f"{link['bytes_per_s_total']:.0f}",
             f"{link['largest_payload_bytes']} B",
             f"{link['largest_encoded_bytes']} B",

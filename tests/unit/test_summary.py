@@ -79,6 +79,12 @@ def test_links_are_counted_by_kind_from_the_senders_relay(good: dict[str, Any]) 
     assert link["largest_datagram_bytes"] == 290
 
 
+def test_a_link_to_the_boat_names_it(good: dict[str, Any]) -> None:
+    text = printed(good | {"links": [link | {"to": 0} for link in good["links"][:1]]})
+    assert "1 → boat" in text
+    assert "1 → 0" not in text
+
+
 def test_success_is_said_in_one_sentence(good: dict[str, Any]) -> None:
     assert headline(good) == (
         True,
