@@ -146,6 +146,13 @@ def test_an_impossible_span_is_refused(start_s, end_s):
         Selection(start_s=start_s, end_s=end_s)
 
 
+def test_a_span_that_begins_where_the_logs_have_ended_is_told_with_their_end():
+    with pytest.raises(LogError, match=r"--start 9: .* end 2\.5 s after"):
+        play(messages([0.0, 2.5]), selection=Selection(start_s=9.0))
+    assert play([], selection=Selection(start_s=9.0))[1].said == []
+    assert play(messages([0.0, 2.5]), selection=Selection(start_s=1.0, end_s=2.0))[1].said == []
+
+
 def test_a_speed_of_nothing_is_refused():
     with pytest.raises(ValueError, match="must be above 0"):
         Playhead(0.0)

@@ -41,8 +41,12 @@ class Selection:
         return self.renames.get(channel, channel)
 
     def cut(self, messages: Iterable[FleetMessage]) -> Iterator[FleetMessage]:
-        """The messages of the span, of every channel; the first of all gives the beginning."""
+        """The messages of the span, of every channel; the first of all gives the beginning.
+
+        Raises LogError where the logs end before the span begins.
+        """
         begin_us: int | None = None
+        at_s = self.start_s
         for entry in messages:
             begin_us = entry.at_us if begin_us is None else begin_us
             at_s = (entry.at_us - begin_us) / 1e6
@@ -51,6 +55,11 @@ class Selection:
             if self.end_s is not None and at_s > self.end_s:
                 return
             yield entry
+        if at_s < self.start_s:
+            raise LogError(
+                f"--start {self.start_s:g}: nothing to play there; the logs end {at_s:.1f} s after their first "
+                "message"
+            )
 
 
 def parse_renames(pairs: Sequence[str]) -> dict[str, str]:
