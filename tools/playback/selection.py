@@ -57,8 +57,8 @@ class Selection:
             yield entry
         if at_s < self.start_s:
             raise LogError(
-                f"--start {self.start_s:g}: nothing to play there; the logs end {at_s:.1f} s after their first "
-                "message"
+                f"--start {self.start_s:g}: nothing to play there; the logs end {at_s:.1f} s after their "
+                "first message"
             )
 
 
