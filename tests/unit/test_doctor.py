@@ -243,3 +243,9 @@ def test_what_is_well_is_said_and_ends_with_0(monkeypatch):
 def test_a_name_that_is_no_check_and_a_drone_without_its_file_are_refused():
     assert doctor("--only", "coffee")[0] == errors.UNUSABLE
     assert doctor("--drone", 1)[0] == errors.UNUSABLE
+
+
+def test_a_drone_that_the_file_does_not_have_is_told_before_anything_is_looked_at(fleet):
+    code, said = doctor(fleet, "--drone", 9)
+    assert code == errors.UNUSABLE
+    assert said.startswith("podwatch: drone 9 is not in the roster [1]")

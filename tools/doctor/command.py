@@ -41,7 +41,7 @@ def doctor(
     with plain_errors():
         if drone is not None and fleet is None:
             raise typer.BadParameter("it needs the fleet file too", param_hint="--drone")
-        mission = _read(fleet) if fleet else None
+        mission = _read(fleet, drone) if fleet else None
         findings = []
         for finding in _look(chosen, mission, fleet, drone):
             findings.append(finding)
@@ -64,10 +64,14 @@ def _chosen(only: list[str] | tuple[()], without: list[str] | tuple[()], *, on_d
     return [name for name in only or usual if name not in without]
 
 
-def _read(path: Path) -> "Mission":
-    from tools.fleet.machine import read_fleet
+def _read(path: Path, drone_id: int | None) -> "Mission":
+    """The fleet file; a drone that it does not have is told before anything is looked at."""
+    from tools.fleet.machine import machine_of, read_fleet
 
-    return read_fleet(path)
+    mission = read_fleet(path)
+    if drone_id is not None:
+        machine_of(mission, drone_id)
+    return mission
 
 
 def _look(
