@@ -10,8 +10,12 @@ import importlib
 import os
 import select
 import signal
+import threading
 from collections.abc import Callable
+from concurrent.futures import Future
+from contextlib import suppress
 from pathlib import Path
+from queue import SimpleQueue
 from typing import Any
 
 import lcm
@@ -76,6 +80,7 @@ class BusRuntime(Runtime):
         self._raw: list[tuple[str, bytes]] = []
         self._failed_takes = 0
         self._running = True
+        self._done_aside: SimpleQueue[Callable[[], None]] = SimpleQueue()
         self._notifier = Notifier()
         self._cpu_s = 0.0
         self._cpu_utime = self._now
@@ -101,6 +106,16 @@ class BusRuntime(Runtime):
 
     def attach(self, transport: Transport, handler: Callable[[], None]) -> None:
         self._transports.append((transport, handler))
+
+    def aside(self, work: Callable[[], Any], then: Callable[["Future[Any]"], None]) -> None:
+        def run() -> None:
+            done = self._outcome(work)
+            self._done_aside.put(lambda: then(done))
+            with suppress(BlockingIOError):  # full: there is enough in it to wake us
+                os.write(self._wake_write, b"\0")
+
+        # A daemon: a process that is told to end does not wait for it.
+        threading.Thread(target=run, daemon=True).start()
 
     def publish_raw(self, channel: str, data: bytes) -> None:
         self._lcm.publish(channel, data)
@@ -153,6 +168,7 @@ class BusRuntime(Runtime):
             self._drain()
             self._read_transports()
             self._reload_if_asked()
+            self._take_what_is_done()
             self._run_due()
         self._notifier.stopping()
         self._stop()
@@ -217,6 +233,11 @@ class BusRuntime(Runtime):
             if transport in self._ready:
                 self._now = self._clock.utime()
                 handler()
+
+    def _take_what_is_done(self) -> None:
+        while not self._done_aside.empty():
+            self._now = self._clock.utime()
+            self._done_aside.get()()
 
     def _run_due(self) -> None:
         """One message, then every due timer: a flood of messages never starves the timers."""

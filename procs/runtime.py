@@ -11,6 +11,7 @@ import struct
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable
+from concurrent.futures import Future
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Protocol
@@ -152,6 +153,13 @@ class Runtime(ABC):
         """Call `handler()` when somebody wants new settings in force; `settings` are the new ones by then."""
         self._reload_handlers.append(handler)
 
+    @abstractmethod
+    def aside(self, work: Callable[[], Any], then: Callable[["Future[Any]"], None]) -> None:
+        """Do `work()` beside the handlers, which go on, and hand what came of it to the handler `then`.
+
+        For what takes longer than a watchdog waits. `work` touches nothing that a handler changes.
+        """
+
     def publish(self, channel: str, message: Any) -> None:
         """Say `message`; drone_id and seq are filled in, and utime where it is 0."""
         seq = self._sequence.get(channel, 0)
@@ -279,6 +287,16 @@ class Runtime(ABC):
         self.ok("reload settings")
         for handler in self._reload_handlers:
             handler()
+
+    @staticmethod
+    def _outcome(work: Callable[[], Any]) -> "Future[Any]":
+        """What `work()` gives, or its error."""
+        done: Future[Any] = Future()
+        try:
+            done.set_result(work())
+        except Exception as error:  # whatever it is: the handler that waits for it must know
+            done.set_exception(error)
+        return done
 
     def _stop(self) -> None:
         """Run the stop handlers, last registered first."""

@@ -5,9 +5,12 @@ camera.detect_hz, with the frame's instant of capture; a frame without animals g
 A frame that is gone from the ring is skipped and counted. When FRAME dies, or in the air its pictures stay
 the same to the last bit for a second, it falls silent: presence fades and nobody acts on old boxes. A model
 that is missing or broken ends the process with exit code 3 and the remedy. On SIGHUP it reads its settings
-and the model again; a new model that cannot be used leaves the old one at work, and the heartbeat says so.
+and the model again, while the old one works on; a new model that cannot be used leaves the old one at work,
+and the heartbeat says so.
 """
 
+from concurrent.futures import Future
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -33,6 +36,7 @@ class DetectorShell:
             self._take(runtime.open("detector"))
         except ModelError as error:
             raise RuntimeFailure(str(error)) from error
+        self._n_reloads = 0
         self._last_utime = 0
         self._changed_utime = 0  # capture of the newest frame that was unlike the one before it
         self._is_landed = False
@@ -81,9 +85,16 @@ class DetectorShell:
             self._height_m, self._height_utime = -state.d_m, state.utime
 
     def reload(self) -> None:
-        """Take the model and the thresholds that the settings name now, or keep what there is."""
+        """Begin to load the model that the settings name now; until it is there, the old one works on."""
+        self._n_reloads += 1
+        self._runtime.aside(partial(self._runtime.open, "detector"), partial(self._loaded, self._n_reloads))
+
+    def _loaded(self, reload: int, loaded: "Future[Any]") -> None:
+        """Take a model and its thresholds, or keep what there is; an older order's come too late."""
+        if reload != self._n_reloads:
+            return
         try:
-            detector = self._runtime.open("detector")
+            detector = loaded.result()
         except (ModelError, RuntimeFailure) as error:
             self._runtime.degraded(f"the new model is not used, the old one stays: {error}", cause="reload")
             return

@@ -146,6 +146,44 @@ def test_a_bus_that_always_fails_ends_the_process(bench):
     assert "lcm_handle_timeout() returned -1" in said
 
 
+# Work that ends when a second message is handled: no process could hear that one while it waits for the work.
+ASIDE = """
+import threading
+second = threading.Event()
+def begin(message):
+    if threading.active_count() > 1:
+        second.set()
+        return
+    runtime.aside(lambda: second.wait(60), lambda done: runtime.publish(
+        channels.SETPOINT, make(setpoint_t, utime=7 if done.result() else 8)))
+    runtime.publish(channels.SETPOINT, make(setpoint_t, utime=1))
+runtime._subscriptions[channels.TRACK].handler = begin
+runtime.run()
+"""
+
+
+def test_what_is_done_aside_keeps_nobody_waiting(bench):
+    bench.start("-c", SHELL.replace("runtime.run()", ASIDE), "SETTINGS", "quick")
+    bench.await_that(lambda: bench.beats)
+    say_track(bench)
+    bench.await_that(lambda: bench.setpoints == [1])
+    say_track(bench)
+    bench.await_that(lambda: bench.setpoints == [1, 7])
+    os.kill(bench.process.pid, signal.SIGTERM)
+    assert bench.end() == (0, "")
+
+
+def test_an_end_does_not_wait_for_what_is_done_aside(bench):
+    bench.start("-c", SHELL.replace("runtime.run()", ASIDE), "SETTINGS", "quick")
+    bench.await_that(lambda: bench.beats)
+    say_track(bench)
+    bench.await_that(lambda: bench.setpoints == [1])
+    told = time.monotonic()
+    os.kill(bench.process.pid, signal.SIGTERM)
+    assert bench.end() == (0, "")
+    assert time.monotonic() - told < HARD_STOP_S
+
+
 HARMLESS = """
 import signal
 signal.signal(signal.SIGUSR1, lambda *_: None)
