@@ -39,6 +39,20 @@ LEAST_HOME_SPACING_M = 3.0  # nearer homes let two drones land on each other
 # A drone never flies nearer to its fence: what lies beyond is never reached (AUTOPILOT fact 11).
 FENCE_KEPT_M = 3.0
 LEAST_TILE_PX = 32
+# What a text must look like, and the same in words, which are what people are told.
+CAMERA = r"^(v4l2|gstreamer|ffmpeg|pictures):.+$"
+AUTOPILOT = r"^(udp|udpout|tcp|serial):.+:\d+$"
+RADIO = r"^[^\s:]+:\d{1,5}$"
+RADIO_OR_NONE = r"^([^\s:]+:\d{1,5})?$"
+DRIVER = r"^[\w.]+:\w+$"
+IN_WORDS = {
+    CAMERA: 'v4l2:DEVICE, gstreamer:PIPELINE, ffmpeg:ADDRESS or pictures:FOLDER, as "v4l2:/dev/video0"',
+    AUTOPILOT: "serial:DEVICE:BAUD, udp:HOST:PORT (listens), udpout:HOST:PORT or tcp:HOST:PORT, as "
+    '"serial:/dev/ttyAMA0:921600"',
+    RADIO: 'HOST:PORT, as "10.76.0.1:14600"',
+    RADIO_OR_NONE: 'HOST:PORT, as "10.76.0.100:14600"',
+    DRIVER: 'package.module:Class, as "my.camera:Camera"',
+}
 
 
 class MissionError(Exception):
@@ -183,23 +197,23 @@ class DriverSpec(Section):
     which.
     """
 
-    driver: str = Field(pattern=r"^[\w.]+:\w+$")
+    driver: str = Field(pattern=DRIVER)
     options: dict[str, Any] = {}
 
 
 class MachineSettings(Section):
     """What one drone's own computer is wired to: for `podwatch fly`, of no weight in a simulated fleet."""
 
-    camera: str = Field("v4l2:/dev/video0", pattern=r"^(v4l2|gstreamer|ffmpeg|pictures):.+$")
-    autopilot: str = Field("serial:/dev/ttyAMA0:921600", pattern=r"^(udp|udpout|tcp|serial):.+:\d+$")
-    radio: str = Field(pattern=r"^[^\s:]+:\d{1,5}$")  # where the others reach its relay
+    camera: str = Field("v4l2:/dev/video0", pattern=CAMERA)
+    autopilot: str = Field("serial:/dev/ttyAMA0:921600", pattern=AUTOPILOT)
+    radio: str = Field(pattern=RADIO)  # where the others reach its relay
     drivers: dict[str, DriverSpec] = {}  # in place of those that follow from the above
 
 
 class BoatSettings(Section):
     """The boat, roster member 0."""
 
-    radio: str = Field("", pattern=r"^([^\s:]+:\d{1,5})?$")  # where the drones reach it; empty: there is none
+    radio: str = Field("", pattern=RADIO_OR_NONE)  # where the drones reach it; empty: there is none
     lost_return_s: float = Field(0.0, ge=0, le=3600)  # silent for so long, it is lost: home. 0: they fly on
     drivers: dict[str, DriverSpec] = {}  # its clock, where that is not the machine's
 
@@ -351,24 +365,37 @@ def validate(data: dict[str, Any], model: type[S], source: str) -> S:
         return model.model_validate(data)
     except ValidationError as error:
         raise MissionError(
-            f"{source}: " + "; ".join(_explain(item, model) for item in error.errors())
+            f"{source}: " + "; ".join(_explain(item, model, data) for item in error.errors())
         ) from None
 
 
-def _explain(item: Any, model: type[BaseModel]) -> str:
-    where = ".".join(str(part) for part in item["loc"])
+def _explain(item: Any, model: type[BaseModel], data: dict[str, Any]) -> str:
+    owner, keys = _place(item["loc"], data)
+    where = ".".join(str(key) for key in keys)
     if item["type"] == "extra_forbidden":
         valid = _valid_keys(model, item["loc"][:-1])
         near = difflib.get_close_matches(str(item["loc"][-1]), valid, n=1, cutoff=0.0)
         return (
-            f"unknown key {where!r}"
+            f"{owner}unknown key {where!r}"
             + (f"; did you mean {near[0]!r}?" if near else "")
             + f" Valid: {', '.join(valid)}"
         )
     message = item["msg"].removeprefix("Value error, ")
+    if item["type"] == "string_pattern_mismatch" and item["ctx"]["pattern"] in IN_WORDS:
+        message = f"write {IN_WORDS[item['ctx']['pattern']]}"
     value = item.get("input")
     shown = "" if isinstance(value, dict | BaseModel) else f" (given: {value!r})"
-    return f"{where}: {message}{shown}" if where else f"{message}"
+    return owner + (f"{where}: {message}{shown}" if where else message)
+
+
+def _place(path: tuple[Any, ...], data: dict[str, Any]) -> tuple[str, tuple[Any, ...]]:
+    """(whose the key at `path` is, the key from there): a drone goes by its id, which people know."""
+    if len(path) < 2 or not isinstance(path[1], int):
+        return "", path
+    entry = data[path[0]][path[1]]
+    if path[0] == "drones" and isinstance(entry, dict) and "id" in entry:
+        return f"drone {entry['id']}: ", path[2:]
+    return f"[[{path[0]}]] entry {path[1] + 1}: ", path[2:]
 
 
 def _valid_keys(model: type[BaseModel], path: tuple[Any, ...]) -> list[str]:

@@ -54,7 +54,11 @@ def test_an_unknown_key_is_answered_with_the_nearest_valid_one(tmp_path):
         ("[search]\nheight_m = nan\n", ("search.height_m", "finite")),
         ("[camera]\nrate_hz = 'fast'\n", ("camera.rate_hz", "number", "'fast'")),
         ("drones = []\n", ("at least one [[drones]] entry is needed",)),
-        ("[[drones]]\nid = 100\n", ("drones.0.id", "99", "100")),
+        ("[[drones]]\nid = 100\n", ("drone 100: id:", "99", "100")),
+        ("[[drones]]\nid = 7\ncamra = 3\n", ("drone 7: unknown key 'camra'; did you mean",)),
+        ("[[drones]]\nhome_n_m = 3.0\n", ("[[drones]] entry 1: id: Field required",)),
+        ("drones = [3]\n", ("[[drones]] entry 1: ",)),
+        ("[boat]\nradio = 'boat'\n", ("boat.radio: write HOST:PORT, as", "'boat'")),
         ("[[drones]]\nid = 2\n[[drones]]\nid = 2\n", ("id 2 is given to 2 drones",)),
         ("[limits]\nmin_height_m = 90\n", ("min_height_m 90.0 must be below max_height_m 80.0",)),
         ("[limits]\nbattery_land = 0.3\n", ("battery_land 0.3 must be below battery_return 0.25",)),
@@ -66,6 +70,21 @@ def test_an_unknown_key_is_answered_with_the_nearest_valid_one(tmp_path):
 def test_what_cannot_be_flown_is_refused_with_the_key_the_value_and_the_limit(text, says, tmp_path):
     said = refused(tmp_path, text)
     assert [part for part in says if part not in said] == [], said
+
+
+@pytest.mark.parametrize(
+    ("line", "says"),
+    [
+        ("radio = 'x'", "drone 4: machine.radio: write HOST:PORT, as \"10.76.0.1:14600\" (given: 'x')"),
+        ("camera = '/dev/video0'", "machine.camera: write v4l2:DEVICE"),
+        ("autopilot = 'ttyAMA0'", "machine.autopilot: write serial:DEVICE:BAUD"),
+        ("drivers.radio.driver = 'lora'", "machine.drivers.radio.driver: write package.module:Class"),
+    ],
+)  # fmt: skip
+def test_what_an_address_must_look_like_is_said_in_words(line, says, tmp_path):
+    said = refused(tmp_path, f"[[drones]]\nid = 4\n[drones.machine]\n{line}\n")
+    assert says in said
+    assert "pattern" not in said
 
 
 def test_a_file_that_cannot_be_read_says_so(tmp_path):
