@@ -127,9 +127,9 @@ def test_a_signal_that_falls_into_lcm_loses_no_message(bench):
         "-c", SHELL.replace("runtime.run()", INTERRUPTED.replace("FAILURES", "3")), "SETTINGS", "quick"
     )
     bench.await_that(lambda: bench.beats)
-    for _ in range(20):
+    for _ in range(10):
         say_track(bench)
-    bench.await_that(lambda: bench.setpoints.count(2) == 20)
+    bench.await_that(lambda: bench.setpoints.count(2) == 10)
     os.kill(bench.process.pid, signal.SIGTERM)
     assert bench.end() == (0, "")
 
