@@ -173,6 +173,12 @@ def test_a_small_screen_shows_what_it_can_and_says_what_it_leaves_out(url):
     ("arguments", "code", "why"),
     [
         (("--text", "--seconds", "0.1"), 1, "nothing was heard on udpm"),
+        (("-c", "trak"), 2, "no channel is called 'trak'; did you mean TRACK?"),
+        (
+            ("--text", "--seconds", "0.1", "-c", "TRAK*", "-c", "TRACK", "-c", "RX_2_RING_MAP"),
+            1,
+            "nothing was heard",
+        ),
         (("--page", "birds"), 2, "there are: channels, ring"),
         (("--url", "memq://"), 2, "udpm://GROUP:PORT"),
     ],

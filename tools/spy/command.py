@@ -1,5 +1,6 @@
 """`podwatch spy`: a drone's bus in the terminal, as text for scripts, or in lcm-spy's windows."""
 
+import difflib
 import sys
 import time
 from typing import TYPE_CHECKING, Annotated
@@ -46,6 +47,8 @@ def spy(
     from tools.spy.datagrams import parse_url
     from tools.spy.session import Session
 
+    for name in channel or ():
+        _known(name)
     if page not in PAGES:
         raise typer.BadParameter(f"{page!r}; there are: {', '.join(PAGES)}", param_hint="--page")
     try:
@@ -73,6 +76,22 @@ def spy(
             _print_text(session, page, seconds, count, is_detailed=bool(channel))
         else:
             _show(session, page, console)
+
+
+def _known(name: str) -> None:
+    """Refuse a name, not a pattern, that no table knows: nobody would ever be heard there."""
+    from lcmtypes import channels
+
+    if channels.kind_of(name) is not None or set(name) & set("*?["):
+        return
+    names = [channel.name for channel in channels.CHANNELS]
+    near = difflib.get_close_matches(name.upper(), names, n=1)
+    guess = f"; did you mean {near[0]}?" if near else "."
+    raise typer.BadParameter(
+        f"no channel is called {name!r}{guess} There are: {', '.join(names)}, and what neighbours said: "
+        f"RX_2_RING_MAP. A program of your own is heard by a pattern: '{name}*'",
+        param_hint="--channel",
+    )
 
 
 def _print_text(session: "Session", page: str, seconds: float, count: int, *, is_detailed: bool) -> None:
