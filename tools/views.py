@@ -8,6 +8,7 @@ numbers, the agreed identities, and each drone's animal in red.
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,6 +32,9 @@ Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 SHOWN_PX = 900  # pictures are drawn no wider than this
+COLUMN_IN = 3.6  # width of one drone's column
+LETTER_IN = 0.095  # width of a letter of a title, at most on average
+LABEL_SHARE = 0.05  # height of a box's label, of the picture's width
 SAME_SHAPE = 0.02  # of the aspect ratio: views of one camera
 # Okabe and Ito (2008), without the red that marks a drone's own animal.
 COLOURS = ("#56B4E9", "#E69F00", "#009E73", "#F0E442", "#CC79A7", "#0072B2", "#FFFFFF", "#999999")
@@ -190,7 +194,9 @@ def _similarity(source: Sequence[Array], target: Sequence[Array]) -> tuple[Array
 def draw(images: Sequence[Image], agreement: Agreement, titles: Sequence[str]) -> Figure:
     """One column a view and four rows: raw, own numbers, agreed identities, the drone's own animal in red."""
     aspect = max(image.shape[0] / image.shape[1] for image in images)
-    figure = Figure(figsize=(3.6 * len(images) + 0.5, 4 * 3.6 * aspect + 1.0), dpi=150, layout="constrained")
+    width_in = COLUMN_IN * len(images) + 0.5
+    told = [_wrapped(part, width_in) for part in _told(agreement).split("; ")]
+    figure = Figure(figsize=(width_in, 4 * COLUMN_IN * aspect + 1.2), dpi=150, layout="constrained")
     grid = figure.subplots(4, len(images), squeeze=False)
     rows = ("seen", "detected", "agreed", "taken")
     for column, (image, title) in enumerate(zip(images, titles, strict=True)):
@@ -204,7 +210,7 @@ def draw(images: Sequence[Image], agreement: Agreement, titles: Sequence[str]) -
             if column == 0:
                 axes.set_ylabel(rows[row], fontsize=12)
         taken = f"takes animal {take}" if take >= 0 else "stands by"
-        grid[0, column].set_title(f"drone {column + 1}\n{title}", fontsize=11)
+        grid[0, column].set_title(f"drone {column + 1}\n{_wrapped(title, COLUMN_IN)}", fontsize=11)
         grid[3, column].set_xlabel(taken, fontsize=11)
         for number, (box, identity) in enumerate(zip(boxes, ids.tolist(), strict=True)):
             _frame(grid[1, column], box, str(number + 1), "#FFFFFF")
@@ -213,8 +219,13 @@ def draw(images: Sequence[Image], agreement: Agreement, titles: Sequence[str]) -
             is_own = identity >= 0 and identity == take
             label = str(identity) if identity >= 0 else "?"
             _frame(grid[3, column], box, label, RED if is_own else "#FFFFFF", width=3.0 if is_own else 0.8)
-    figure.suptitle(_told(agreement), fontsize=12)
+    figure.suptitle("\n".join(told), fontsize=12)
     return figure
+
+
+def _wrapped(text: str, width_in: float) -> str:
+    """In lines that fit into a figure of that width."""
+    return textwrap.fill(text, round(width_in / LETTER_IN))
 
 
 def _shrunk(image: Image) -> tuple[Image, float]:
@@ -231,8 +242,10 @@ def _frame(axes: Axes, box: Array, label: str, colour: str, width: float = 1.6) 
         Rectangle((left, top), right - left, bottom - top, fill=False, edgecolor=colour, linewidth=width)
     )
     ink = "#000000" if colour in ("#FFFFFF", "#F0E442", "#56B4E9", "#E69F00") else "#FFFFFF"
+    # Above a box at the picture's edge its label would be cut.
+    place = "top" if top < LABEL_SHARE * axes.get_xlim()[1] else "bottom"
     axes.text(
-        left, top, label, fontsize=9, fontweight="bold", color=ink, va="bottom", ha="left",
+        left, top, label, fontsize=9, fontweight="bold", color=ink, va=place, ha="left",
         bbox={"facecolor": colour, "edgecolor": "none", "pad": 1.5}, clip_on=True,
     )  # fmt: skip
 

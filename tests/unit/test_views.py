@@ -4,12 +4,14 @@ whales.
 
 import os
 import re
+from itertools import pairwise
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 import typer
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from numpy.typing import NDArray
 
 from drivers.cameras.pinhole import Pinhole, Pose
@@ -230,6 +232,25 @@ def test_the_figure_has_four_rows_with_own_numbers_and_agreed_names() -> None:
     red = [patch.get_edgecolor()[:3] for axes in figure.axes[6:] for patch in axes.patches]
     assert [colour[0] > 0.9 and colour[1] < 0.2 for colour in red] == [True, False, False, False]
     assert figure.axes[7].get_xlabel() == "stands by"
+
+
+@pytest.mark.parametrize("n_views", [2, 5])
+def test_no_title_and_no_label_of_the_figure_is_cut(n_views: int) -> None:
+    images = [np.zeros((480, 640, 3), np.uint8)] * n_views
+    boxes = [np.array([[30.0, 2, 90, 60]])] * n_views
+    agreement = Agreement(boxes, [np.array([0])] * n_views, False, 0.5, [0, *[-1] * (n_views - 1)], False)
+    figure = draw(
+        images, agreement, ["a_picture_with_a_name_of_some_length_from_a_long_expedition.jpg"] * n_views
+    )
+    FigureCanvasAgg(figure).draw()
+    whole = figure.bbox
+    titles = [axes.title.get_window_extent() for axes in figure.axes[:n_views]]
+    for text in (*[text.get_window_extent() for text in figure.texts], *titles):
+        assert whole.x0 <= text.x0 < text.x1 <= whole.x1
+        assert text.y1 <= whole.y1
+    assert all(left.x1 < right.x0 for left, right in pairwise(titles))
+    for axes in figure.axes:
+        assert all(text.get_window_extent().y1 <= axes.bbox.y1 for text in axes.texts)
 
 
 def test_one_box_a_view_is_said_to_prove_nothing() -> None:
