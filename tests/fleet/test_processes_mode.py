@@ -40,6 +40,7 @@ from tools.sim.processes import SHARED_FOLDER, ProcessFleet
 from tools.sim.run import fly_lockstep, write_truth_notes
 from tools.sim.settings import SimMission
 from tools.sim.watch import Watch
+from tools.supervision import program
 
 pytestmark = pytest.mark.timeout(600)
 
@@ -325,6 +326,29 @@ def test_a_process_that_hangs_is_ended_by_its_policy_and_only_if_it_is_still_tha
             assert sleeper.wait(timeout=10) == -signal.SIGKILL
         else:
             assert sleeper.poll() is None
+
+
+def test_while_processes_start_it_is_told_how_many_run(laid_out, monkeypatch):
+    monkeypatch.setattr(process_mode, "TELL_EVERY_S", 0.0)
+    fleet = laid_out("run")
+    beats = iter(
+        [program(drone_id, name) for drone_id in fleet.plan.mission.roster for name in processes.BY_NAME]
+    )
+    n_beats = 9 * len(fleet.plan.mission.roster)
+
+    def look() -> None:
+        beat = next(beats, None)
+        if beat is None:
+            fleet._page.set(0.0, 1.0)
+        else:
+            fleet._heard.add(beat)
+
+    monkeypatch.setattr(fleet, "look", look)
+    told: list[str] = []
+    fleet.wait_until_ready(lambda: None, told.append)
+    assert told[0].startswith(f"0 of {n_beats} run after ")
+    assert told[4].startswith(f"4 of {n_beats} run after ")
+    assert [line.split(" after")[0] for line in told[n_beats:]] == [f"All {n_beats} run"]
 
 
 def test_two_runs_at_once_share_no_bus_no_port_and_no_memory_and_never_hear_each_other(laid_out):

@@ -197,11 +197,14 @@ def _counted(count: int, one: str, many: str = "") -> str:
 
 
 def _fly(plan: RunPlan, console: Console, *, headless: bool, lockstep: bool, fallback: str) -> None:
+    def tell(line: str) -> None:
+        console.print(line, highlight=False, markup=False, soft_wrap=True)
+
     def fly(screen: LiveView | None) -> None:
         if lockstep:
             fly_lockstep(plan, screen, fallback)
         else:
-            fly_processes(plan, screen)
+            fly_processes(plan, screen, tell)
 
     if headless:
         fly(None)

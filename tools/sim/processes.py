@@ -35,6 +35,7 @@ START_LIMIT_S = 90.0
 # starts what has died within one.
 CHECK_EVERY_S = 0.5
 LOOK_S = 0.1
+TELL_EVERY_S = 5.0
 SHARED_FOLDER = Path("/dev/shm")
 MASK_TRACKER = "procs.tracker.mask_tracker:MaskTracker"
 
@@ -82,23 +83,32 @@ class ProcessFleet:
         """Simulation time, s."""
         return self._page.read()[0] / 1e6
 
-    def wait_until_ready(self, check_interrupt: Callable[[], None]) -> None:
-        """Until every process has beaten once; then the simulation clock begins. Raises SupervisorError, and
-        what `check_interrupt` raises.
+    def wait_until_ready(
+        self, check_interrupt: Callable[[], None], tell: Callable[[str], None] = lambda _: None
+    ) -> None:
+        """Until every process has beaten once; then the simulation clock begins.
+
+        `tell` is given a line now and then, for people. Raises SupervisorError, and what `check_interrupt`
+        raises.
         """
         wanted = {program(d, p.name) for d in self.plan.mission.roster for p in processes.PROCESSES}
-        limit = time.monotonic() + START_LIMIT_S
+        began_s = told_s = time.monotonic()
         while self._page.read()[1] == 0:
             check_interrupt()
             missing = sorted(wanted - self._heard) or ["world"]
-            if time.monotonic() > limit:
+            now_s = time.monotonic()
+            if now_s > began_s + START_LIMIT_S:
                 raise SupervisorError(
                     f"{', '.join(missing)}: not ready within {START_LIMIT_S:.0f} s; is the machine too busy? "
                     f"What they said is in {self.plan.folder / 'output'}"
                 )
             if missing == ["world"]:  # again and again, as the world may not listen yet
                 self._command(kind="go")
+            elif now_s >= told_s + TELL_EVERY_S:
+                told_s = now_s
+                tell(f"{len(self._heard)} of {len(wanted)} run after {now_s - began_s:.0f} s")
             self.look()
+        tell(f"All {len(wanted)} run after {time.monotonic() - began_s:.0f} s; the fleet begins.")
         self._in_flight = True
 
     def look(self) -> None:

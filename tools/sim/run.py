@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+from procs import processes
 from procs.relay.keys import make_key, read_key
 from tools.sim.lockstep import LockstepFleet
 from tools.sim.plan import RunPlan
@@ -68,12 +69,16 @@ def fly_lockstep(plan: RunPlan, screen: Screen | None, fallback_reason: str = ""
             write_truth_notes(plan, watch, "lockstep", fallback_reason, fleet.now_s, time.monotonic() - began)
 
 
-def fly_processes(plan: RunPlan, screen: Screen | None) -> None:
-    """Fly a plan as operating-system processes and write its notes. Raises SupervisorError."""
+def fly_processes(plan: RunPlan, screen: Screen | None, tell: Callable[[str], None] = lambda _: None) -> None:
+    """Fly a plan as operating-system processes and write its notes; `tell` is given lines for people while
+    they start. Raises SupervisorError.
+    """
     prepare(plan)
+    n_drones, n_each = len(plan.mission.roster), len(processes.PROCESSES)
+    tell(f"Starting {n_drones * n_each} processes, {n_each} for each drone; that can take half a minute.")
     watch = Watch(plan.mission, screen)
     with _interrupt_between_steps() as check_interrupt, ProcessFleet(plan, watch) as fleet:
-        fleet.wait_until_ready(check_interrupt)
+        fleet.wait_until_ready(check_interrupt, tell)
         began = time.monotonic()
         try:
             over = False
