@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -107,6 +108,60 @@ def test_boxes_in_place_of_pixels_cannot_look_at_a_picture(tmp_path):
 def test_addresses_of_autopilots_that_cannot_be(tmp_path, monkeypatch, options, words):
     monkeypatch.setattr(flight, "has_multicast_route", lambda: True)
     assert words in refused(tmp_path, *options)
+
+
+@pytest.fixture
+def waiting(tmp_path: Path) -> Path:
+    """A mission that waits for an order."""
+    path = tmp_path / "waiting.toml"
+    path.write_text('duration_s = 90\n[search]\nstart = "operator"\n')
+    return path
+
+
+def test_a_fleet_that_waits_for_an_order_is_not_flown_where_nobody_can_give_one(
+    tmp_path, waiting, monkeypatch
+):
+    assert "no boat can join a flight in lockstep; fly without" in refused(tmp_path, waiting, "--lockstep")
+    monkeypatch.setattr(flight, "has_multicast_route", lambda: False)
+    result = podwatch("sim", waiting, "--out", tmp_path / "runs")
+    assert result.exit_code == errors.MISSING
+    assert "no boat can join" in result.stderr
+    assert "ip route replace" in result.stderr
+
+
+class ReadyFleet:
+    """Processes that are there at once, and a flight that is over."""
+
+    now_s = 2.0
+
+    def __init__(self, *_: object) -> None: ...
+
+    def __enter__(self) -> "ReadyFleet":
+        return self
+
+    def __exit__(self, *_: object) -> None: ...
+
+    def wait_until_ready(self, check_interrupt: object, tell: Callable[[str], None]) -> None:
+        tell("All run")
+
+    def look(self) -> None: ...
+
+
+@pytest.mark.parametrize("options", [(), ("--headless",)])
+def test_a_fleet_that_waits_for_an_order_says_how_to_give_it(tmp_path, waiting, monkeypatch, options):
+    monkeypatch.setattr(flight, "has_multicast_route", lambda: True)
+    monkeypatch.setattr(run, "ProcessFleet", ReadyFleet)
+    monkeypatch.setattr(Watch, "step", lambda *_: True)
+    for name in ("finish", "print_summary", "_print_expected"):  # nothing flew
+        monkeypatch.setattr(flight, name, lambda *_: None)
+    runs = ("--out", tmp_path / "runs")
+    said = [podwatch("sim", mission, *runs, *options).stdout for mission in (waiting, "default")]
+    [order, *_] = [line for line in said[0].splitlines() if "podwatch boat" in line]
+    assert order.strip().endswith("/boat.toml")
+    assert "Starting 27 processes, 9 for each drone" in said[0]
+    assert said[0].index("Starting") < said[0].index("All run") < said[0].index(order)
+    assert "and type there: start. Without it the run ends after 90 s." in said[0]
+    assert "podwatch boat" not in said[1]
 
 
 def test_addresses_are_taken_in_every_form(monkeypatch):

@@ -54,6 +54,7 @@ def command(
         if log_frames and sensor == "boxes":
             raise MissionError("--log-frames: --sensor boxes looks at no pixels; drop one of them")
         chosen = with_overrides(read_mission(mission), drones, animals, seed, duration, log_frames=log_frames)
+        _see_who_starts(chosen, lockstep, fallback)
         addresses = _addresses(autopilot, chosen, lockstep, fallback)
         plan = _plan(chosen, out, sensor, scene, addresses)
     if fallback:
@@ -189,6 +190,18 @@ def _addresses(autopilot: str, mission: SimMission, lockstep: bool, fallback: st
     if fallback:
         raise RuntimeFailure(f"{told}, and nothing else can fly here: {fallback}")
     return named
+
+
+def _see_who_starts(mission: SimMission, lockstep: bool, fallback: str) -> None:
+    """A fleet that waits for an order would wait for ever where no boat can give one. lockstep, fallback and
+    errors as for `_addresses`.
+    """
+    if mission.search.start != "operator" or not (lockstep or fallback):
+        return
+    told = 'search.start = "operator" waits for a boat\'s order, and no boat can join a flight in lockstep'
+    if lockstep:
+        raise MissionError(f'{told}; fly without --lockstep, or write "auto" in the file')
+    raise RuntimeFailure(f"{told}, and nothing else can fly here: {fallback}")
 
 
 def _counted(count: int, one: str, many: str = "") -> str:

@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import shlex
 import signal
 import time
 from collections.abc import Callable, Iterator
@@ -79,6 +80,12 @@ def fly_processes(plan: RunPlan, screen: Screen | None, tell: Callable[[str], No
     watch = Watch(plan.mission, screen)
     with _interrupt_between_steps() as check_interrupt, ProcessFleet(plan, watch) as fleet:
         fleet.wait_until_ready(check_interrupt, tell)
+        if plan.mission.search.start == "operator":
+            tell(
+                'It waits on the ground for an order (search.start = "operator"). In another terminal:\n'
+                f"  podwatch boat {shlex.quote(str(plan.folder / 'boat.toml'))}\n"
+                f"and type there: start. Without it the run ends after {plan.mission.duration_s:.0f} s."
+            )
         began = time.monotonic()
         try:
             over = False
