@@ -18,6 +18,7 @@ from rich.table import Table
 from rich.text import Text
 
 from lcmtypes import channels
+from tools.called import Order, call_words, fleet_order, order_of
 from tools.evidence import DroneLog, Run, load_run
 from tools.judge import DroneVerdict, Verdict, judge
 from tools.sights import inside, monitor_spans
@@ -48,6 +49,7 @@ def summary_of(run: Run, verdict: Verdict) -> Summary:
     """
     window = verdict.monitor_window_s
     latencies_ms = _latencies_ms(run)
+    states = {drone_id: messages[channels.MISSION_STATE] for drone_id, messages in run.messages.items()}
     return {
         "mission": run.mission.get("name"),
         "mode": run.about.get("mode"),
@@ -58,6 +60,7 @@ def summary_of(run: Run, verdict: Verdict) -> Summary:
         "distinct": verdict.distinct,
         "consensus": verdict.consensus,
         "reasons": list(verdict.reasons),
+        "ordered": _order(fleet_order(states)),
         "episodes": verdict.episodes,
         "seconds_to_monitor": _rounded(verdict.seconds_to_monitor, 2),
         "monitor_window_s": [_rounded(t_s, 2) for t_s in window] if window else None,
@@ -78,7 +81,23 @@ def summary_of(run: Run, verdict: Verdict) -> Summary:
 
 
 def headline(summary: Summary) -> tuple[bool | None, str]:
-    """(whether it went well, None where that cannot be told; one sentence for a biologist)."""
+    """(whether it went well, None where that cannot be told; one sentence for a biologist).
+
+    Of a flight that a person ended early it is told what was reached until then.
+    """
+    is_good, words = _went(summary)
+    call = call_words(summary)
+    if not call:
+        return is_good, words
+    if summary["ordered"] and summary["monitor_window_s"] is None:
+        reached = "its animals together" if len(summary["drones"]) > 1 else "an animal"
+        return None, f"{call}, before it watched {reached}."
+    if summary["ordered"] and is_good:
+        return True, f"{words[:-1]}, until {call[:1].lower()}{call[1:]}."
+    return is_good, f"{words} {call}."
+
+
+def _went(summary: Summary) -> tuple[bool | None, str]:
     watching = [drone for drone in summary["drones"] if drone["monitor_s"]]
     if summary["distinct"] is None:
         return None, (
@@ -136,12 +155,17 @@ def _drone(run: Run, log: DroneLog, about: DroneVerdict) -> Summary:
         "assigned": about.is_assigned,
         "final_state": "DEAD" if death_s is not None else log.states[-1][1] if log.states else None,
         "died_s": _rounded(death_s, 2),
+        "ordered": _order(order_of(run.messages[log.id][channels.MISSION_STATE])),
         "monitor_s": _rounded(about.monitor_s, 2),
         "in_image_share": _rounded(about.in_image_share, 4),
         "watch_share": _rounded(about.watch_share, 4),
         "tracker_hz": _rounded(float(seen.sum()) / about.monitor_s, 2) if about.monitor_s else None,
         "setpoint_age_p99_ms": _percentile(ages_ms, 99),
     }
+
+
+def _order(order: Order | None) -> Summary | None:
+    return None if order is None else {"order": order.word, "at_s": _rounded(order.at_s, 2)}
 
 
 def _setpoint_ages_ms(states: Sequence[tuple[float, Any]]) -> list[float]:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from drivers.cameras.pinhole import Pinhole, Pose, apply_homography
 from lcmtypes import channels, make, podwatch
 from logs.writer import LogWriter
-from procs.navigator.states import State
+from procs.navigator.states import Event, State
 from tools.evidence import Clock, DroneLog, Truth, drone_log
 
 CAMERA = Pinhole((640, 480), float(np.radians(60)))
@@ -54,6 +54,7 @@ class FakeRun:
     claims: tuple[int, ...] | None = None
     standby: tuple[int, ...] = ()
     deaths: dict[int, float] = field(default_factory=dict)
+    called: dict[int, tuple[float, Event]] = field(default_factory=dict)  # home or down, by a person
     clocks: dict[int, Clock] = field(default_factory=dict)
     is_labelled: bool = True
     seed: int = 0
@@ -84,6 +85,8 @@ class FakeRun:
         )
 
     def state(self, drone: int, t_s: float) -> State:
+        if t_s >= self.called_s(drone):
+            return State.RETURN
         if drone in self.standby and t_s >= self.monitor_s[0]:
             return State.STANDBY if t_s < self.monitor_s[1] else State.RETURN
         if t_s >= self.monitor_s[0]:
@@ -97,6 +100,9 @@ class FakeRun:
             )
         state = max(entry for entry in BEFORE_MONITOR if entry[0] <= t_s / self.monitor_s[0])[1]
         return State.STANDBY if state == State.SCOUT and drone > 1 else state
+
+    def called_s(self, drone: int) -> float:
+        return self.called[drone][0] if drone in self.called else np.inf
 
     def pose(self, drone: int, t_s: float) -> Pose:
         """On its way to its animal from home, over it with a little sway in MONITOR, then home again."""
@@ -263,7 +269,7 @@ class FakeRun:
         return make(
             podwatch.mission_state_t,
             state=int(self.state(drone, t_s)),
-            reason="by hand",
+            reason=self.called[drone][1].value if t_s >= self.called_s(drone) else "by hand",
             animal=self._identity(drone, t_s),
         )
 

@@ -214,6 +214,27 @@ def test_logs_alone_make_a_report_that_says_whose_word_it_is(alone: Path) -> Non
     assert "Distinct: not known." in words
 
 
+@pytest.mark.parametrize(
+    ("called_s", "told"),
+    [
+        (80.0, "for 10 s. A person called the fleet home at 1:20."),
+        (65.0, "A person called the fleet home at 1:05, before it came to watch an animal."),
+    ],
+)
+def test_a_fleet_that_a_person_calls_home_is_no_failure_also_by_logs_alone(
+    tmp_path: Path, called_s: float, told: str
+) -> None:
+    run = MappedRun(
+        duration_s=90.0,
+        monitor_s=(70.0, 88.0),
+        called=dict.fromkeys((1, 2, 3), (called_s, Event.ORDER_RETURN)),
+    )
+    flight = read_flight([logs_only(tmp_path, run)])
+    is_good, words = sentence(flight, watched_spans(flight))
+    assert is_good is None
+    assert words.endswith(told)
+
+
 def test_logs_of_far_clocks_lie_on_one_axis_of_time(alone: Path) -> None:
     flight = read_flight([alone])
     starts_s = {

@@ -8,7 +8,13 @@ from typing import Any
 import pytest
 from rich.console import Console
 
+from lcmtypes import make, podwatch
+from procs.navigator.states import Event, State
 from tests.unit.fake_run import FakeRun
+from tools.called import Order, fleet_order
+from tools.sim import flight
+from tools.sim.expect import Safety
+from tools.sim.settings import Expect, SimMission
 from tools.summary import headline, print_summary, summarise, write_summary
 
 # As `podwatch sim` promises them.
@@ -127,3 +133,70 @@ def test_a_drone_without_a_log_has_no_figures_but_a_row(tmp_path: Path) -> None:
     (folder / "drone_1.mcap").unlink()
     row = summarise(folder)["drones"][0]
     assert (row["final_state"], row["tracker_hz"], row["animal"], row["monitor_s"]) == (None, None, None, 0)
+
+
+def test_a_fleet_that_a_person_calls_home_is_told_by_what_it_reached_until_then(tmp_path: Path) -> None:
+    run = FakeRun(called={drone: (20.0 + 0.2 * drone, Event.ORDER_RETURN) for drone in (1, 2, 3)})
+    summary = summarise(run.write(tmp_path / "run"))
+    assert summary["ordered"] == {"order": "return", "at_s": pytest.approx(20.6, abs=0.2)}
+    assert headline(summary) == (
+        True,
+        "Each drone kept an animal of its own in view, and all agreed which animal is which, until a person "
+        "called the fleet home at 21 s.",
+    )
+
+
+def test_a_fleet_that_is_called_down_before_it_watched_has_not_failed(tmp_path: Path) -> None:
+    run = FakeRun(called=dict.fromkeys((1, 2, 3), (5.0, Event.ORDER_LAND)))
+    summary = summarise(run.write(tmp_path / "run"))
+    assert summary["monitor_window_s"] is None
+    sentence = "A person made the fleet land at 5 s, before it watched its animals together."
+    assert headline(summary) == (None, sentence)
+    assert printed(summary).strip().startswith(f"? {sentence}")
+
+
+def test_one_drone_that_is_called_home_excuses_no_other(tmp_path: Path) -> None:
+    run = FakeRun(called={2: (20.0, Event.ORDER_RETURN)}, watch=lambda drone, t_s: 1 if drone == 3 else drone)
+    summary = summarise(run.write(tmp_path / "run"))
+    assert summary["ordered"] is None
+    is_good, words = headline(summary)
+    assert is_good is False
+    assert words.startswith("The drones did not each keep")
+    assert words.endswith(" A person called drone 2 home at 20 s.")
+
+
+def row(state: State, event: Event | None = None) -> podwatch.mission_state_t:
+    return make(podwatch.mission_state_t, state=int(state), reason=event.value if event else "")
+
+
+def test_an_order_ends_a_flight_only_where_nobody_works_on() -> None:
+    ordered = [(1.0, row(State.SCOUT)), (30.0, row(State.RETURN, Event.ORDER_RETURN))]
+    follows = [(31.0, row(State.MONITOR)), (32.0, row(State.RETURN, Event.FLEET_RETURNS))]
+    at_home = [(1.0, row(State.RETURN, Event.BATTERY_LOW)), (60.0, row(State.LANDED))]
+    of_its_own = [(31.0, row(State.MONITOR)), (32.0, row(State.RETURN, Event.WATCHED))]
+    anew = [*ordered, (90.0, row(State.TAKEOFF))]
+    order = Order("return", 30.0)
+    assert fleet_order({1: ordered, 2: follows, 3: at_home}) == order
+    assert fleet_order({1: ordered, 2: [(20.0, row(State.MONITOR))]}) == order, "it died before"
+    assert fleet_order({1: ordered, 2: of_its_own}) is None
+    assert fleet_order({1: anew}) is None
+    assert fleet_order({1: at_home}) is None
+
+
+@pytest.mark.parametrize(
+    ("nearest_m", "words"),
+    [
+        (5.0, "A person called the fleet home at 21 s, before the flight had done all that its file expects"),
+        (1.0, "The flight fell short of what its file expects"),
+    ],
+)
+def test_what_a_called_home_flight_did_not_reach_is_no_failure_but_its_safety_is(
+    good: dict[str, Any], monkeypatch: pytest.MonkeyPatch, nearest_m: float, words: str
+) -> None:
+    monkeypatch.setattr(flight, "read_safety", lambda *_: Safety(nearest_m, (1, 2), 3.0, ()))
+    mission = SimMission(expect=Expect(distinct=True, min_monitor_s=55.0))
+    summary = good | {"ordered": {"order": "return", "at_s": 20.6}}
+    out = StringIO()
+    flight._print_expected(mission, Path(), summary, Console(file=out, width=200))
+    assert out.getvalue().strip().startswith(words)
+    assert "expected at least 55 s" in out.getvalue()

@@ -9,6 +9,7 @@ from itertools import groupby, pairwise
 
 from lcmtypes import channels
 from procs.navigator.states import Event
+from tools.called import call_words
 from tools.report.flights import Flight
 from tools.report.watching import lost_spans, shared_spans
 from tools.report.words import PROCESS_WORDS, clock, count, drones, lasting, plain, state_words
@@ -56,10 +57,19 @@ def sentence(flight: Flight, watched: dict[int, list[Span]]) -> tuple[bool | Non
     """(whether it went well, None where nobody can know; the mission in one sentence)."""
     if flight.knows_animals:
         is_good, words = headline(flight.summary)
+        words = plain(words)
         if is_good and flight.run.truth.deaths:
             words = words.replace(" in view", " in view for as long as it flew")
         return is_good, words
     n_watched = sum(1 for log in flight.run.drones if monitor_spans(log))
+    call = plain(call_words(flight.summary))
+    if not n_watched and flight.summary["ordered"]:
+        return None, f"{call}, before it came to watch an animal."
+    is_good, words = _by_their_word(flight, watched, n_watched)
+    return is_good, f"{words} {call}." if call else words
+
+
+def _by_their_word(flight: Flight, watched: dict[int, list[Span]], n_watched: int) -> tuple[bool | None, str]:
     if not n_watched:
         return False, "No drone came to watch an animal."
     shared = shared_spans(watched)

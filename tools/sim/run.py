@@ -76,7 +76,7 @@ def fly_processes(plan: RunPlan, screen: Screen | None, tell: Callable[[str], No
     """
     prepare(plan)
     n_drones, n_each = len(plan.mission.roster), len(processes.PROCESSES)
-    tell(f"Starting {n_drones * n_each} processes, {n_each} for each drone; that can take half a minute.")
+    tell(f"Starting {n_drones * n_each} processes, {n_each} for each drone; that can take a minute.")
     watch = Watch(plan.mission, screen)
     with _interrupt_between_steps() as check_interrupt, ProcessFleet(plan, watch) as fleet:
         fleet.wait_until_ready(check_interrupt, tell)
