@@ -161,6 +161,7 @@ def test_a_fleet_that_waits_for_an_order_says_how_to_give_it(tmp_path, waiting, 
     assert "Starting 27 processes, 9 for each drone" in said[0]
     assert said[0].index("Starting") < said[0].index("All run") < said[0].index(order)
     assert "and type there: start. Without it the run ends after 90 s." in said[0]
+    assert "The fleet waits on the ground for an order" in said[0]
     assert "podwatch boat" not in said[1]
 
 
