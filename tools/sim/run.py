@@ -82,7 +82,8 @@ def fly_processes(plan: RunPlan, screen: Screen | None, tell: Callable[[str], No
         fleet.wait_until_ready(check_interrupt, tell)
         if plan.mission.search.start == "operator":
             tell(
-                'The fleet waits on the ground for an order (search.start = "operator"). In another terminal:\n'
+                'The fleet waits on the ground for an order (search.start = "operator"). '
+                "In another terminal:\n"
                 f"  podwatch boat {shlex.quote(str(plan.folder / 'boat.toml'))}\n"
                 f"and type there: start. Without it the run ends after {plan.mission.duration_s:.0f} s."
             )
