@@ -51,6 +51,11 @@ class Conditions:
     jpeg: int = 100
 
     @property
+    def clear(self) -> float:
+        """Share of a difference in brightness that reaches the picture."""
+        return (1 - self.haze) * self.exposure
+
+    @property
     def glare(self) -> float:
         """Sheen and sparks together, 0 to 1."""
         return min(self.glint * 0.6 + self.glitter, 1.0)
@@ -207,7 +212,7 @@ def _scene(
     seen = (
         _no_animals(side)
         if species is None
-        else draw_and_see(place.renderer, image, camera, pose, animals, species)
+        else draw_and_see(place.renderer, image, camera, pose, animals, species, conditions.clear)
     )
     if place.kind == "sea":
         _breaths(image, rng, camera, pose, animals)
@@ -269,8 +274,7 @@ def _labelled(
     least_long_px: float,
 ) -> Scene:
     """The scene with its animals told apart into those that count and those too faint to."""
-    clear = (1 - c.haze) * c.exposure
-    contrast, noise = seen.contrast * clear, np.hypot(seen.noise * clear, c.noise / 2)
+    contrast, noise = seen.contrast * c.clear, np.hypot(seen.noise * c.clear, c.noise / 2)
     long_px = (seen.boxes[:, 2:] - seen.boxes[:, :2]).max(axis=1, initial=0)
     counts = (
         (seen.shares >= LEAST_SHARE)

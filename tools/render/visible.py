@@ -42,8 +42,12 @@ def draw_and_see(
     pose: Pose,
     animals: list[AnimalView],
     species: Species,
+    clear: float = 1.0,
 ) -> Visible:
-    """Draw the animals into `image` in place, the deepest first, and say what each of them shows."""
+    """Draw the animals into `image` in place, the deepest first, and say what each of them shows.
+
+    clear: the share of a difference in brightness that air and exposure leave to the camera.
+    """
     count, (height, width) = len(animals), image.shape[:2]
     water = np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.uint8)
     mask = np.zeros((height, width), np.uint8)
@@ -59,7 +63,7 @@ def draw_and_see(
         inside = np.zeros((height, width), np.uint8)
         cv2.fillPoly(inside, [np.round(ring).astype(np.int32) for ring in rings[row]], 255)
         own = cv2.absdiff(image, before).max(axis=2)
-        mask[(inside > 0) & (own >= _least_change(own[inside > 0]))] = animals[row].id + 1
+        mask[(inside > 0) & (own >= _least_change(own[inside > 0], clear))] = animals[row].id + 1
         np.copyto(change, own.astype(np.float32), where=inside > 0)
     boxes, oriented = np.zeros((count, 4), np.float32), np.zeros((count, 4, 2), np.float32)
     shares, contrast, noise = (np.zeros(count, np.float32) for _ in range(3))
@@ -75,10 +79,10 @@ def draw_and_see(
     return Visible(boxes, oriented, shares, contrast, noise, mask)
 
 
-def _least_change(changes: NDArray[np.uint8]) -> float:
-    """From which change on a pixel of an animal counts as showing it."""
+def _least_change(changes: NDArray[np.uint8], clear: float) -> float:
+    """From which change on a pixel of an animal counts as showing it to the camera."""
     clearest = float(np.percentile(changes, 95)) if len(changes) else 0.0
-    return max(SEEN_LEVELS, SEEN_SHARE * clearest)
+    return max(SEEN_LEVELS / clear, SEEN_SHARE * clearest)
 
 
 def _rings(to_image: Array, animal: AnimalView, species: Species) -> list[Array]:
