@@ -196,6 +196,16 @@ def test_clutter_of_every_kind_changes_the_picture_inside_it_and_at_its_border()
     assert (calm == 90).all()
 
 
+def test_clutter_that_is_drawn_later_covers_no_animal() -> None:
+    boxes = np.array([[20, 10, 90.5, 60.5, 1], [100, 70, 150, 110, 0]], np.float32)
+    drawn = np.full((120, 160, 3), 90, np.uint8)
+    for seed in range(30):
+        add_clutter(drawn, np.random.default_rng(seed), 40.0, share=3.0, keep_clear=boxes)
+    assert (drawn != 90).any()
+    assert (drawn[10:61, 20:91] == 90).all()
+    assert (drawn[70:111, 100:151] == 90).all()
+
+
 def test_effects_do_what_they_say() -> None:
     rng = np.random.default_rng(0)
     image = rng.uniform(60, 120, (60, 80, 3)).astype(np.float32)

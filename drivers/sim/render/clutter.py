@@ -190,11 +190,17 @@ KINDS: tuple[tuple[_Drawn, float, int, bool], ...] = (
 
 
 def add_clutter(
-    image: Image, rng: np.random.Generator, length_px: float, on_water: bool = True, share: float = 1.0
+    image: Image,
+    rng: np.random.Generator,
+    length_px: float,
+    on_water: bool = True,
+    share: float = 1.0,
+    keep_clear: NDArray[np.float32] | None = None,
 ) -> None:
     """Draw a few random things into `image` in place; a whale there would be about `length_px` long.
 
-    `share` times the usual chances: above 1 for views that show no animal.
+    `share` times the usual chances: above 1 for views that show no animal. keep_clear (N, 4) xyxy px: what
+    would change a pixel of these boxes is left out.
     """
     height, width = image.shape[:2]
     for draw, chance, most, needs_water in KINDS:
@@ -203,6 +209,22 @@ def add_clutter(
         for _ in range(int(rng.integers(1, most + 1))):
             at = (int(rng.integers(width)), int(rng.integers(height)))
             length = int(np.clip(length_px * rng.uniform(0.25, 1.3), 8, 130))
-            draw(image, rng, at, length)
-    if on_water and rng.random() < 0.08 * share:  # a breath whose animal is gone
+            if keep_clear is None:
+                draw(image, rng, at, length)
+                continue
+            tried = image.copy()
+            draw(tried, rng, at, length)
+            if not _changes_within(keep_clear, tried, image):
+                image[:] = tried
+    if on_water and keep_clear is None and rng.random() < 0.08 * share:  # a breath whose animal is gone
         add_spout(image, rng, (int(rng.integers(width)), int(rng.integers(height))), length_px)
+
+
+def _changes_within(boxes: NDArray[np.float32], image: Image, before: Image) -> bool:
+    corners = [np.clip(box, 0, None).astype(int).tolist() for box in boxes[:, :4]]
+    return any(
+        not np.array_equal(
+            image[top : bottom + 1, left : right + 1], before[top : bottom + 1, left : right + 1]
+        )
+        for left, top, right, bottom in corners
+    )

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from drivers.sim.render import Image
+from drivers.sim.render.clutter import add_clutter
 from tools.train.detector.photographs import empty_seas, photograph_sample
 from tools.train.detector.samples import (
     WITH_EXTRAS,
@@ -28,6 +29,7 @@ from tools.train.detector.samples import (
 __all__ = ["Batches", "Mixture", "own_pictures", "photographs"]
 
 ENDLESS = 100_000_000  # batches; the trainer stops before
+CLUTTER, CLUTTER_WHALE_PX = 2.0, (20.0, 200.0)  # times the scenes' chances; beside whales of such lengths
 SCENES_A_FILE = 500  # rendered at a time: a killed run loses no more
 
 
@@ -41,6 +43,7 @@ class Mixture:
     photograph_share: float = 0.25  # of the samples; the rest are rendered
     own_share: float = 0.5  # of the samples are the user's own pictures, where there are any
     empty_share: float = 0.12  # of the rendered samples at least: boats and foam must not pass for whales
+    clutter_share: float = 0.5  # get new boats, logs, foam: the scenes' own would be learnt by heart
     letterbox_share: float = 0.4  # cameras are wide, the network's input is square
     scenes: int = 8000  # rendered once: more of them cost disk and time, crops vary them
     scenes_on_photographs: int = 2000  # of them in addition: rendered animals on real water
@@ -66,6 +69,9 @@ class Batches(torch.utils.data.Dataset[tuple[torch.Tensor, list[torch.Tensor]]])
         images, boxes = np.empty((count, side, side, 3), np.uint8), []
         for index in range(count):
             sample = self._sample(rng)
+            if rng.random() < self.mixture.clutter_share:
+                length_px = float(np.exp(rng.uniform(*np.log(CLUTTER_WHALE_PX)))) * side / 320
+                add_clutter(sample.image, rng, length_px, share=CLUTTER, keep_clear=sample.boxes)
             sample = Sample(augment(sample.image, rng), sample.boxes)
             if rng.random() < self.mixture.letterbox_share:
                 sample = letterboxed(sample, rng)
