@@ -59,17 +59,18 @@ def views(
 @app.command("render")
 def render(
     out: Annotated[Path, typer.Argument(help="Folder to write, in the YOLO layout.")],
-    n: Annotated[int, typer.Option("-n", "--n", min=1, help="How many pictures.")] = 100,
+    n: Annotated[int, typer.Option("-n", "--n", min=1, help="How many scenes.")] = 100,
     seed: Annotated[int, typer.Option(min=0, help="The same seed gives the same pictures.")] = 0,
     split: Annotated[str, typer.Option(help="train, val, val_sperm or empty")] = "train",
     width: Annotated[int, typer.Option(min=64, help="Of a picture, px.")] = 640,
     height: Annotated[int, typer.Option(min=64, help="Of a picture, px.")] = 480,
+    views: Annotated[int, typer.Option(min=1, help="Of each scene: the same animals, other places.")] = 1,
 ) -> None:
     """Render labelled scenes for training and validation."""
     from tools.render import command
 
     with plain_errors():
-        command(out, n, seed, split, width, height)
+        command(out, n, seed, split, width, height, views)
 
 
 @train.command("detector")

@@ -116,6 +116,30 @@ def test_no_validation_scene_shows_a_species_or_a_water_of_the_trainer() -> None
     assert min(abs(a - b) for i, a in enumerate(seeds) for b in seeds[:i]) >= 100_000_000
 
 
+def whole(scene: Scene) -> list[int]:
+    """Animals that no edge of the picture cuts, and that do not hang into the deep."""
+    inside = (scene.boxes > 1).all(axis=1) & (scene.boxes < (319, 239, 319, 239)).all(axis=1)
+    return scene.ids[inside & (scene.depth_m < 0.5)].tolist()
+
+
+def test_the_views_of_a_scene_show_the_same_animals_at_the_same_places() -> None:
+    shared = 0
+    drawn = list(scenes(12, 3, "val", (320, 240), views=3))
+    assert len(drawn) == 36
+    for first, *others in (drawn[k : k + 3] for k in range(0, 36, 3)):
+        for other in others:
+            assert not np.array_equal(first.image, other.image)
+            assert other.species == first.species
+            for identity in set(whole(first)) & set(whole(other)):
+                places = [
+                    apply_homography(view.image_to_ground, view.oriented[view.ids == identity].mean(axis=1))
+                    for view in (first, other)
+                ]
+                assert np.linalg.norm(places[0] - places[1]) < 6.0, "the middle of what shows, m"
+                shared += 1
+    assert shared > 10
+
+
 def test_so_many_animals_as_are_asked_for_and_all_of_them_count() -> None:
     for wanted in (1, 6):
         for scene in scenes(3, 2, "val", (320, 240), animals=wanted):

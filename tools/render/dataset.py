@@ -14,23 +14,29 @@ FOLDERS = ("images", "labels", "oriented", "masks", "truth")
 
 
 def render_dataset(
-    out: Path, n: int, seed: int, split: str = "train", side: tuple[int, int] = (640, 480)
+    out: Path,
+    n: int,
+    seed: int,
+    split: str = "train",
+    side: tuple[int, int] = (640, 480),
+    views: int = 1,
 ) -> Path:
-    """Write `n` scenes of `split` to `out` and return the path of its data.yaml.
+    """Write `n` scenes of `split`, `views` pictures of each, to `out` and return the path of its data.yaml.
 
     images/SPLIT/*.jpg; labels/SPLIT/*.txt, boxes as YOLO text; oriented/SPLIT/*.txt, turned boxes as four
     corners (class x1 y1 ... x4 y4, shares of the picture); masks/SPLIT/*.png, 0 or an animal's id + 1;
     truth/SPLIT/*.json, everything in px and metres with the 3x3 homography from pixels to ground metres.
-    Raises ValueError for a bad split or count.
+    The views of a scene show the same animals under the same ids. Raises ValueError for a bad split or count.
     """
-    if n < 1:
-        raise ValueError(f"n {n}: at least one scene must be asked for")
+    if n < 1 or views < 1:
+        raise ValueError(f"n {n}, views {views}: at least one scene and one view must be asked for")
     folders = {name: out / name / split for name in FOLDERS}
-    for index, scene in enumerate(scenes(n, seed, split, side, camera_effects=True)):
-        if index == 0:
+    for number, scene in enumerate(scenes(n, seed, split, side, camera_effects=True, views=views)):
+        index, view = divmod(number, views)
+        if number == 0:
             for folder in folders.values():
                 folder.mkdir(parents=True, exist_ok=True)
-        stem = f"{seed:04d}_{index:06d}"
+        stem = f"{seed:04d}_{index:06d}" + (f"_{view}" if views > 1 else "")
         cv2.imwrite(str(folders["images"] / f"{stem}.jpg"), scene.image, [cv2.IMWRITE_JPEG_QUALITY, 95])
         cv2.imwrite(str(folders["masks"] / f"{stem}.png"), scene.mask)
         (folders["labels"] / f"{stem}.txt").write_text(_box_lines(scene, side))
@@ -80,7 +86,14 @@ def _data_yaml(out: Path) -> Path:
 
 
 def command(
-    out: Path, n: int = 100, seed: int = 0, split: str = "train", width: int = 640, height: int = 480
+    out: Path,
+    n: int = 100,
+    seed: int = 0,
+    split: str = "train",
+    width: int = 640,
+    height: int = 480,
+    views: int = 1,
 ) -> None:
     """Render N labelled scenes into OUT in the YOLO layout; splits: train, tune, val, val_sperm, empty."""
-    print(f"wrote {n} scenes, {render_dataset(out, n, seed, split, (width, height))}")
+    written = render_dataset(out, n, seed, split, (width, height), views)
+    print(f"wrote {n} scenes{f' in {views} views each' if views > 1 else ''}, {written}")

@@ -100,12 +100,15 @@ def scenes(
     animals: int | None = None,
     camera_effects: bool = False,
     seas: Sequence[Image] = (),
+    views: int = 1,
 ) -> Iterator[Scene]:
     """`count` scenes of `split`, `side` (width, height) px; `shapes` are measured right whales.
 
     animals: exactly so many that count, and none that does not, in every scene. camera_effects: haze, blur,
     noise and compression too (the trainer adds its own, different at every look). seas: photographs of empty
-    water that take the place of the rendered one. Raises ValueError for an unknown split.
+    water that take the place of the rendered one. views: of each scene, one after another: the same animals
+    under the same ids, at the same instant, each from a place and with an air and a camera of its own. Raises
+    ValueError for an unknown split.
     """
     if split not in SPLITS:
         raise ValueError(f"split {split!r} is not known; there are: {', '.join(SPLITS)}")
@@ -115,9 +118,13 @@ def scenes(
         if place is None or index % SCENES_A_SEA == 0:
             place = _place(rng, drawn, drawn.seed + seed * 10_000 + index, shapes, seas)
         for _ in range(TRIES):
-            scene = _scene(rng, place, drawn, side, animals, camera_effects)
-            if scene is not None:
+            shot = _shot(rng, place, drawn, side, animals, camera_effects)
+            scene = None if shot is None else _taken(rng, place, drawn, shot, animals)
+            if shot is not None and scene is not None:
                 yield scene
+                for _ in range(views - 1):
+                    another = _from_elsewhere(rng, place, shot, camera_effects)
+                    yield _drawn(rng, place, drawn, another)
                 break
         else:
             raise ValueError(f"{animals} animals do not fit into a picture of {side}; ask for fewer")
@@ -182,15 +189,27 @@ def _conditions(rng: np.random.Generator, place: _Place, camera_effects: bool) -
     )
 
 
-def _scene(
+@dataclass(frozen=True)
+class _Shot:
+    """What is to be drawn: animals on the ground, and who looks at them, when and through what."""
+
+    camera: Pinhole
+    pose: Pose
+    conditions: Conditions
+    animals: list[AnimalView]
+    length_m: float
+    t_s: float
+
+
+def _shot(
     rng: np.random.Generator,
     place: _Place,
     split: Split,
     side: tuple[int, int],
     wanted: int | None,
     camera_effects: bool,
-) -> Scene | None:
-    """None where it shows another number of animals than was wanted."""
+) -> _Shot | None:
+    """None where fewer animals fit in than were wanted."""
     poster, species = place.kind == "grass", place.species
     usual_m = species.length_m if species is not None else float(rng.uniform(5, 15))
     length_m = float(rng.uniform(*POSTER_LENGTHS_M)) if poster else usual_m
@@ -203,24 +222,50 @@ def _scene(
         animals = make_pod(rng, camera, pose, pod)
     if wanted is not None and len(animals) != wanted:
         return None
-    length_px = length_m / camera.metres_per_px(pose.height_m)
+    t_s = float(rng.uniform(0, 60)) if place.sea is None else 0.0
+    return _Shot(camera, pose, conditions, animals, length_m, t_s)
+
+
+def _from_elsewhere(rng: np.random.Generator, place: _Place, shot: _Shot, camera_effects: bool) -> _Shot:
+    """The same animals as another drone sees them: about as high, over their middle, turned at random."""
+    height_m = shot.pose.height_m * float(np.exp(rng.normal(0, 0.15)))
+    middle = [shot.pose.n_m, shot.pose.e_m]
+    if shot.animals:
+        middle = np.mean([(animal.n_m, animal.e_m) for animal in shot.animals], axis=0).tolist()
+    north_m, east_m = (np.array(middle) + rng.normal(0, 0.12 * height_m, 2)).tolist()
+    roll, pitch = np.clip(rng.normal(0, 0.1, 2), -0.35, 0.35).tolist()
+    pose = Pose(north_m, east_m, -height_m, roll, pitch, float(rng.uniform(-np.pi, np.pi)))
+    return replace(shot, pose=pose, conditions=_conditions(rng, place, camera_effects))
+
+
+def _taken(
+    rng: np.random.Generator, place: _Place, split: Split, shot: _Shot, wanted: int | None
+) -> Scene | None:
+    """None where the picture shows another number of animals than was wanted."""
+    scene = _drawn(rng, place, split, shot)
+    exact = len(scene.ids) == wanted and not len(scene.faint)
+    return scene if wanted is None or exact else None
+
+
+def _drawn(rng: np.random.Generator, place: _Place, split: Split, shot: _Shot) -> Scene:
+    """The picture of a shot, with what it shows of each animal."""
+    camera, pose, conditions, animals = shot.camera, shot.pose, shot.conditions, shot.animals
+    length_px = shot.length_m / camera.metres_per_px(pose.height_m)
     if place.sea is None:
-        image = place.renderer.render(camera, pose, float(rng.uniform(0, 60)))
+        image = place.renderer.render(camera, pose, shot.t_s)
     else:
-        image = _cut(place.sea, rng, side)
+        image = _cut(place.sea, rng, camera.image_size)
     add_clutter(image, rng, length_px, place.kind == "sea", split.clutter)
     seen = (
-        _no_animals(side)
-        if species is None
-        else draw_and_see(place.renderer, image, camera, pose, animals, species, conditions.clear)
+        _no_animals(camera.image_size)
+        if place.species is None
+        else draw_and_see(place.renderer, image, camera, pose, animals, place.species, conditions.clear)
     )
     if place.kind == "sea":
         _breaths(image, rng, camera, pose, animals)
     image = _photographed(image, rng, conditions)
     to_ground = camera.image_to_ground(pose)
-    scene = _labelled(image, seen, animals, to_ground, pose.height_m, place, conditions, split.least_long_px)
-    exact = len(scene.ids) == wanted and not len(scene.faint)
-    return scene if wanted is None or exact else None
+    return _labelled(image, seen, animals, to_ground, pose.height_m, place, conditions, split.least_long_px)
 
 
 def _no_animals(side: tuple[int, int]) -> Visible:
