@@ -1,7 +1,8 @@
 """Large pictures in overlapping tiles, so that small animals are seen at the size that the network knows.
 
 Every tile owns the part of the picture that is nearer to its middle than to its neighbours'. An animal counts
-in the tile that owns its centre, where it lies whole: so none is counted twice, and none in halves.
+in the tile that owns its centre, where it lies whole; one that is large for a tile counts as the whole
+picture shows it: so none is counted twice, and none in halves.
 """
 
 from collections import deque
@@ -13,11 +14,9 @@ from numpy.typing import NDArray
 
 from procs.detector.decode import Candidates
 
-__all__ = ["LEAST_ANIMAL_PX", "SeenLength", "Tile", "merge", "owned", "plan"]
+__all__ = ["LEAST_ANIMAL_PX", "SeenLength", "Tile", "merge", "owned", "pieces", "plan"]
 
-OVERLAP = (
-    0.25  # of a tile that its neighbour shows too; an animal up to half as long is whole where it counts
-)
+OVERLAP = 0.25  # of a tile that its neighbour shows too; an animal nearly so long is whole where it counts
 LEAST_ANIMAL_PX = 16.0  # long side at the network's size; smaller animals are missed (docs/detector.md)
 WANTED_ANIMAL_PX = 24.0  # long side that tiles give it, where there is time
 MOST_ENLARGED = 0.5  # px of the picture for each px of the input: more enlarging shows nothing new
@@ -28,6 +27,8 @@ MOST_TILES = 64
 SLACK_PX = 4.0  # of the input: by how much two looks may differ about where an animal is
 SAME_IOU = 0.3  # two looks' boxes that overlap by so much are one animal
 SAME_AREA = 3.0  # or that hold each other's centres and are not more different than that
+LARGE = 0.5  # of a tile; a longer animal may be whole in none, and boxes of its parts end short of the cut
+MOST_INSIDE = 0.5  # of a tile's box; with more inside a large animal's box it is a piece of that animal
 
 
 class Tile(NamedTuple):
@@ -107,6 +108,17 @@ def owned(found: Candidates, tile: Tile, size: tuple[int, int], shrink: float) -
     return found.take(whole & np.all((centre >= core[:2]) & (centre <= core[2:]), axis=1))
 
 
+def pieces(found: Candidates, whole: Candidates, side_px: float) -> NDArray[np.bool_]:
+    """(N,) which boxes of a tile are a head or a tail of an animal that is large for tiles of `side_px` and
+    that the `whole` picture's look has; one that it has by itself too is an animal beside that one.
+    """
+    is_large = (whole.boxes[:, 2:] - whole.boxes[:, :2]).max(axis=1, initial=0) > LARGE * side_px
+    large = whole.take(is_large)
+    inside = _shared(found, large) > MOST_INSIDE * _areas(found.boxes)[:, None]
+    inside &= found.classes[:, None] == large.classes[None]
+    return np.asarray(inside.any(axis=1) & ~_doubles(found, whole.take(~is_large)))
+
+
 def merge(looks: list[Candidates]) -> Candidates:
     """All looks' boxes in px of the picture, each animal once; of two looks at one the earlier counts."""
     merged = looks[0]
@@ -127,9 +139,7 @@ def _doubles(new: Candidates, known: Candidates) -> NDArray[np.bool_]:
     double = np.zeros(len(new.scores), np.bool_)
     if not (len(new.scores) and len(known.scores)):
         return double
-    low = np.maximum(new.boxes[:, None, :2], known.boxes[None, :, :2])
-    high = np.minimum(new.boxes[:, None, 2:], known.boxes[None, :, 2:])
-    shared = np.clip(high - low, 0, None).prod(axis=2)
+    shared = _shared(new, known)
     areas, known_areas = _areas(new.boxes), _areas(known.boxes)
     both = areas[:, None] + known_areas[None] - shared
     iou = shared / np.maximum(both, 1e-6)
@@ -145,6 +155,13 @@ def _doubles(new: Candidates, known: Candidates) -> NDArray[np.bool_]:
         double[row] = True
         likeness[row], likeness[:, column] = 0, 0
     return double
+
+
+def _shared(found: Candidates, others: Candidates) -> NDArray[np.float32]:
+    """(N, M) px^2 that two looks' boxes have in common."""
+    low = np.maximum(found.boxes[:, None, :2], others.boxes[None, :, :2])
+    high = np.minimum(found.boxes[:, None, 2:], others.boxes[None, :, 2:])
+    return np.asarray(np.clip(high - low, 0, None).prod(axis=2))
 
 
 def _areas(boxes: NDArray[np.float32]) -> NDArray[np.float32]:

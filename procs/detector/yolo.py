@@ -19,7 +19,7 @@ from procs.detector.decode import Candidates, ModelError, best_first, decode, su
 from procs.detector.letterbox import Letterbox
 from procs.detector.network import PROVIDERS, Names, Network, open_session
 from procs.detector.sight import Sight
-from procs.detector.tiles import SeenLength, Tile, merge, owned, plan
+from procs.detector.tiles import SeenLength, Tile, merge, owned, pieces, plan
 
 __all__ = ["Detections", "Detector", "ModelError", "open_session"]
 
@@ -111,7 +111,8 @@ class Detector:
             piece = self._look(image[top:bottom, left:right], timings)
             begun = time.perf_counter()
             piece = piece._replace(boxes=piece.boxes + np.array([left, top, left, top], np.float32))
-            looks.append(owned(piece, tile, (width, height), (right - left) / self.input_size[0]))
+            piece = owned(piece, tile, (width, height), (right - left) / self.input_size[0])
+            looks.append(piece.take(~pieces(piece, whole, min(right - left, bottom - top))))
             timings["decode"] += (time.perf_counter() - begun) * 1e3
         begun = time.perf_counter()
         # The whole comes last: where a tile has an animal too, it has it larger.

@@ -46,8 +46,11 @@ def raw(*rows: tuple[float, ...], cells: int = 100) -> np.ndarray:
     return output
 
 
-def blob_network(path: Path, side: int = 64) -> Path:
-    """A network that really looks: one box round all that is bright in red, one for green, one for blue."""
+def blob_network(path: Path, side: int = 64, share: float = 1.0) -> Path:
+    """A network that really looks: one box round all that is bright in red, one for green, one for blue.
+
+    share: of what is bright, each way, that the box holds; below 1 it ends short of where an animal is cut.
+    """
     axis = np.arange(side, dtype=np.float32)
     constants = {
         "threshold": np.float32(0.6),
@@ -56,6 +59,7 @@ def blob_network(path: Path, side: int = 64) -> Path:
         "near": np.full((1, 1, side), -1.0, np.float32),
         "one": np.float32(1),
         "half": np.float32(0.5),
+        "share": np.float32(share),
         "zero": np.float32(0),
         "rows": np.array([1], np.int64),
     }
@@ -73,7 +77,8 @@ def blob_network(path: Path, side: int = 64) -> Path:
             helper.make_node("Add", [f"{last}_px", "one"], [last]),
             helper.make_node("Add", [first, last], [f"sum_{name}"]),
             helper.make_node("Mul", [f"sum_{name}", "half"], [f"centre_{name}"]),
-            helper.make_node("Sub", [last, first], [f"size_{name}"]),
+            helper.make_node("Sub", [last, first], [f"seen_{name}"]),
+            helper.make_node("Mul", [f"seen_{name}", "share"], [f"size_{name}"]),
         ]
     nodes.append(helper.make_node("ReduceMax", ["light"], ["score"], axes=[2, 3], keepdims=0))
     parts = ["centre_x", "centre_y", "size_x", "size_y", "score"]

@@ -1,19 +1,22 @@
 """Large pictures in tiles: where they are cut, what counts in each, and every animal once."""
 
+import os
 from itertools import pairwise
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from procs.detector.decode import Candidates
-from procs.detector.tiles import SeenLength, Tile, merge, owned, plan
+from procs.detector.tiles import SeenLength, Tile, merge, owned, pieces, plan
 from procs.detector.yolo import Detections, Detector
 from tests.unit.detector_networks import blob_network, network, raw
 
 INPUT = (320, 320)
+DATA = Path(os.environ.get("PODWATCH_REAL_DATA", Path(__file__).parents[3] / "shared" / "data"))
 
 
 @settings(deadline=None, max_examples=60)
@@ -86,6 +89,17 @@ def test_one_animal_seen_twice_is_one_and_two_side_by_side_stay_two() -> None:
     assert len(merge([pair, calf]).boxes) == 3
 
 
+def test_a_piece_lies_in_a_large_animal_that_the_whole_picture_shows() -> None:
+    """Tiles of 100 px: an animal of 80 px is large, a calf of 20 px is not."""
+    whole = candidates((10, 10, 90, 50), (30, 20, 50, 35))
+    found = candidates((8, 12, 45, 48), (29, 19, 51, 36), (80, 10, 110, 50), (10, 60, 90, 90))
+    assert pieces(found, whole, 100).tolist() == [True, False, False, False]
+    assert pieces(found, whole, 200).tolist() == [False] * 4, "no animal is large for such tiles"
+    assert pieces(found, candidates(), 100).tolist() == [False] * 4
+    boats = whole._replace(classes=np.ones(2, np.int64))
+    assert pieces(found, boats, 100).tolist() == [False] * 4, "a whale beside a boat"
+
+
 def test_a_length_is_learnt_doubted_and_forgotten() -> None:
     seen = SeenLength()
     assert seen.ask() is None
@@ -150,6 +164,53 @@ def test_an_animal_larger_than_a_tile_is_found_in_the_whole(tmp_path: Path) -> N
     found = seen_at(detector, [(40, 60, 300, 200)], (400, 300))
     assert len(found) == 1
     assert np.abs(found.boxes[0] - (40, 60, 300, 200)).max() <= 6  # a network's pixel is six of the picture
+
+
+@pytest.mark.parametrize("length", [50, 70, 110, 180])
+def test_a_large_animal_is_one_where_a_network_boxes_its_ends_by_themselves(
+    tmp_path: Path, length: int
+) -> None:
+    """Boxes four fifths as long as what a tile shows end far from the cut, as those of a whole animal do."""
+    detector = Detector(blob_network(tmp_path / "blobs.onnx", share=0.8), tile=96)
+    for left in range(0, 400 - length, 10):
+        box = (left, 100, left + length, 100 + length // 3)
+        found = seen_at(detector, [box], (400, 300))
+        assert len(found) == 1, (box, found.boxes)
+        assert found.boxes[0, 2] - found.boxes[0, 0] == pytest.approx(0.8 * length, abs=8), box
+
+
+def test_a_small_animal_over_a_large_one_stays(tmp_path: Path) -> None:
+    """The whole picture shows both; where a tile shows the small one too, it shows it larger."""
+    detector = Detector(blob_network(tmp_path / "blobs.onnx", share=0.8), tile=96)
+    for left in range(70, 200, 10):
+        mother, calf = (40, 60, 300, 200), (left, 110, left + 30, 125)
+        found = seen_at(detector, [mother, calf], (400, 300))
+        assert len(found) == 2, (calf, found.boxes)
+        small = found.boxes[np.argmin(found.boxes[:, 2] - found.boxes[:, 0])]
+        assert np.abs(small - (left + 3, 111.5, left + 27, 123.5)).max() <= 2.5, (calf, small)
+
+
+def n_inside(boxes: np.ndarray, large: np.ndarray) -> int:
+    """How many boxes lie more than half in a large one."""
+    shared = np.minimum(boxes[:, 2:], large[2:]) - np.maximum(boxes[:, :2], large[:2])
+    sizes = boxes[:, 2:] - boxes[:, :2]
+    return int(np.sum(np.clip(shared, 0, None).prod(axis=1) > 0.5 * sizes.prod(axis=1)))
+
+
+def test_no_head_or_tail_of_a_photographed_whale_counts_by_itself() -> None:
+    """Right whales half a picture long, in tiles that show most of them in parts."""
+    photographs = sorted((DATA / "right_whales" / "images").glob("*.jpg"))[:20]
+    if not photographs:
+        pytest.skip("needs ../shared/data/right_whales")
+    whole, tiled = Detector(), Detector(tile=400)
+    n_large = 0
+    for path in photographs:
+        picture = cv2.imread(str(path))
+        boxes, expected = tiled.detect(picture).boxes, whole.detect(picture).boxes
+        for large in expected[(expected[:, 2:] - expected[:, :2]).max(axis=1) > 240]:
+            n_large += 1
+            assert n_inside(boxes, large) <= n_inside(expected, large), path.name
+    assert n_large > len(photographs) / 2
 
 
 def test_auto_learns_from_the_boxes_how_large_animals_are(tmp_path: Path) -> None:
