@@ -8,11 +8,12 @@ rule is in tools/render/visible.py, and the figures show how recall falls toward
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 
 import models
 from procs.detector.yolo import Detector
-from tools.bench.detection_figures import draw
+from tools.bench.detection_figures import by_hardness, draw
 from tools.bench.detection_measure import (
     CONFIDENCE,
     CONFIDENCES,
@@ -118,6 +119,21 @@ def paper_rows() -> Iterator[Row]:
         yield Row(f"Table 1, {name}, the paper's", 1407, "-", f"{accuracy} / {false} / {missed} %")
 
 
+def _hardness_rows(m: Measures) -> Iterator[Row]:
+    """Recall by what makes an animal hard to see; drawn as well."""
+    ours = m.frames["ours"]
+    for title, found, edges in by_hardness(ours):
+        parts = [
+            f"{low:g}-{high:g}: {100 * hits / n:.0f} ({n})"
+            for (low, high), (hits, n) in zip(pairwise(edges), found, strict=True)
+            if n
+        ]
+        yield Row(f"recall % (animals) by {title}", ours.pictures, f"val {m.seed}", ", ".join(parts))
+    share = ours.faint_found / max(ours.faint, 1)
+    name = "too small or faint to count, found all the same"
+    yield Row(name, ours.faint, f"val {m.seed}", _percent(share))
+
+
 def _sperm_rows(m: Measures) -> Iterator[Row]:
     """The paper's own species, which the trainer drew too, on water that it never drew: no bar names it."""
     n, seed = m.scenes(SPERM_SCENES), f"val_sperm {m.seed}"
@@ -181,6 +197,7 @@ def sets(m: Measures) -> list[tuple[str, Callable[[], Iterator[Row]]]]:
     return [
         ("rendered validation", lambda: _frame_rows(m)),
         ("the paper's Table 1", paper_rows),
+        ("hard to see", lambda: _hardness_rows(m)),
         ("sperm whales", lambda: _sperm_rows(m)),
         ("exact counts", lambda: _count_rows(m)),
         ("photographs", lambda: _photograph_rows(m)),
