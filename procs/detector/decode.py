@@ -124,13 +124,13 @@ def _finished(output: NDArray[np.float32], oriented: bool, confidence: float) ->
 def _queries(output: NDArray[np.float32], confidence: float, size: tuple[int, int]) -> Candidates:
     """RT-DETR: centre x, y, width, height as shares of the input; score and class, or a score a class."""
     rows = output[0]
-    if rows.shape[1] == 6:
-        best, classes = rows[:, 4], np.nan_to_num(rows[:, 5]).astype(np.int64)
-    else:
+    best, classes = rows[:, 4], np.nan_to_num(rows[:, -1])
+    # With two classes both are 6 columns: class numbers are whole, a column of scores is not.
+    if rows.shape[1] != 6 or np.any(classes % 1):
         best, classes = rows[:, 4:].max(axis=1), rows[:, 4:].argmax(axis=1)
     kept = np.flatnonzero(~(best < confidence))
     boxes = rows[kept, :4] * np.array([*size, *size], np.float32)
-    return _sound(_upright(boxes, None, best[kept], classes[kept]), len(rows))
+    return _sound(_upright(boxes, None, best[kept], classes[kept].astype(np.int64)), len(rows))
 
 
 def _upright(

@@ -111,6 +111,17 @@ def test_rt_detr_gives_shares_of_a_picture_that_was_stretched(tmp_path: Path, ou
     np.testing.assert_allclose(found.boxes, [[48, 18, 80, 30]], atol=1e-3)
 
 
+def test_rt_detr_with_two_classes_is_read_by_what_its_last_column_holds(tmp_path: Path) -> None:
+    """(1, 300, 6) either way: whole numbers are classes, others are scores of the second class."""
+    names = {**DETR, "names": TWO["names"]}
+    box, other = (0.5, 0.5, 0.25, 0.25), (0.25, 0.25, 0.125, 0.125)
+    for rows in (((*box, 0.9, 1), (*other, 0.6, 0)), ((*box, 0.1, 0.9), (*other, 0.6, 0.02))):
+        found = Detector(network(tmp_path / "detr.onnx", table(*rows), names)).detect(PICTURE)
+        np.testing.assert_allclose(found.boxes, [[24, 24, 40, 40], [12, 12, 20, 20]], atol=1e-3)
+        np.testing.assert_allclose(found.scores, [0.9, 0.6])
+        assert found.classes.tolist() == [1, 0]
+
+
 def test_an_older_rt_detr_is_known_by_its_description(tmp_path: Path) -> None:
     described = {**NAMES, "description": "Ultralytics rtdetr-l model"}
     output = table((0.5, 0.5, 0.5, 0.5, 0.9))
