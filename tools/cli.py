@@ -10,7 +10,7 @@ from tools import fleet, log
 from tools.bench.commands import bench
 from tools.boat.command import boat
 from tools.doctor.command import doctor
-from tools.errors import plain_errors, wanted_extra
+from tools.errors import UnusableError, plain_errors, wanted_extra
 from tools.fly import fly
 from tools.play import play
 from tools.replay import replay_command
@@ -61,15 +61,17 @@ def render(
     out: Annotated[Path, typer.Argument(help="Folder to write, in the YOLO layout.")],
     n: Annotated[int, typer.Option("-n", "--n", min=1, help="How many scenes.")] = 100,
     seed: Annotated[int, typer.Option(min=0, help="The same seed gives the same pictures.")] = 0,
-    split: Annotated[str, typer.Option(help="train, val, val_sperm or empty")] = "train",
+    split: Annotated[str, typer.Option(help="train, tune, val, val_sperm or empty")] = "train",
     width: Annotated[int, typer.Option(min=64, help="Of a picture, px.")] = 640,
     height: Annotated[int, typer.Option(min=64, help="Of a picture, px.")] = 480,
     views: Annotated[int, typer.Option(min=1, help="Of each scene: the same animals, other places.")] = 1,
 ) -> None:
     """Render labelled scenes for training and validation."""
-    from tools.render import command
+    from tools.render import SPLITS, command
 
     with plain_errors():
+        if split not in SPLITS:
+            raise UnusableError(f"split {split!r} is not known; there are: {', '.join(SPLITS)}")
         command(out, n, seed, split, width, height, views)
 
 
@@ -80,6 +82,10 @@ def train_detector(
     ),
     data: Annotated[
         Path | None, typer.Option(help="A data.yaml in the YOLO layout to train on as well.")
+    ] = None,
+    classes: Annotated[
+        list[str] | None,
+        typer.Option(help="Name or number of a class of --data that counts as a whale; again for another."),
     ] = None,
     begin_from: Annotated[
         Path | None,
@@ -97,7 +103,8 @@ def train_detector(
     with wanted_extra("train"):
         from tools.train.detector.training import command, settings_of
     with plain_errors():
-        command(out, settings_of(width, steps, minutes, seed, threads), data, begin_from, smoke, int8)
+        settings = settings_of(width, steps, minutes, seed, threads)
+        command(out, settings, data, begin_from, smoke, int8, classes or ())
 
 
 @train.command("assigner")
@@ -113,7 +120,7 @@ def train_assigner(
         from tools.train.assigner import paper, training
     with plain_errors():
         if loss not in ("ours", "paper"):
-            raise ValueError(f"loss {loss!r} is not known; there are: ours, paper")
+            raise UnusableError(f"loss {loss!r} is not known; there are: ours, paper")
         trainer = training if loss == "ours" else paper
         trainer.command(out, seed, steps, smoke)
 

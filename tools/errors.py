@@ -12,7 +12,16 @@ from contextlib import contextmanager
 
 import typer
 
-__all__ = ["FAILED", "INTERRUPTED", "MISSING", "UNUSABLE", "exit_code_of", "plain_errors", "wanted_extra"]
+__all__ = [
+    "FAILED",
+    "INTERRUPTED",
+    "MISSING",
+    "UNUSABLE",
+    "UnusableError",
+    "exit_code_of",
+    "plain_errors",
+    "wanted_extra",
+]
 
 FAILED, UNUSABLE, MISSING = 1, 2, 3
 INTERRUPTED = 130  # as shells say of SIGINT
@@ -24,6 +33,7 @@ EXIT_CODES = {
     ("tools.boat.orders", "OrderError"): UNUSABLE,
     ("tools.boat.orders", "BoatError"): FAILED,
     ("tools.bench.faults", "FaultsError"): FAILED,
+    ("tools.errors", "UnusableError"): UNUSABLE,
     ("tools.evidence", "EvidenceError"): UNUSABLE,
     ("tools.views", "ViewsError"): UNUSABLE,
     ("procs.detector.decode", "ModelError"): MISSING,
@@ -32,6 +42,10 @@ EXIT_CODES = {
     ("tools.supervision", "CannotStartError"): MISSING,
     ("tools.supervision", "SupervisorError"): FAILED,
 }
+
+
+class UnusableError(ValueError):
+    """A file, an option or a value that was given is of no use; the message says why, and the remedy."""
 
 
 @contextmanager

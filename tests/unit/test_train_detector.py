@@ -1,5 +1,6 @@
 """Training in small: the assignment, the loss, a run killed and resumed, weights taken up, the exports."""
 
+import re
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +14,7 @@ from typer.testing import CliRunner
 
 from procs.detector.yolo import Detector
 from tools.cli import app
+from tools.errors import UNUSABLE, UnusableError
 from tools.render import render_dataset
 from tools.train.detector.export import check_export, export, load_weights, quantise
 from tools.train.detector.loss import assign, detection_loss, pair_iou
@@ -172,13 +174,42 @@ def test_eight_bits_keep_boxes_and_scores(trained: Path, tmp_path: Path) -> None
     assert second.scores.std() > 0.2 * first.scores.std() > 0
 
 
+def test_what_is_given_is_read_before_minutes_are_spent_on_rendering(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tools.train.detector.pictures._rendered", lambda *_, **__: pytest.fail("rendered"))
+    with pytest.raises(UnusableError, match=r"none\.yaml: no such file"):
+        train(tmp_path / "run", TINY, data=tmp_path / "none.yaml")
+    with pytest.raises(UnusableError, match=r"none\.onnx: no such file"):
+        train(tmp_path / "run", TINY, begin_from=tmp_path / "none.onnx")
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("render OUT --split nope", "split 'nope' is not known; there are: train"),
+        ("train detector --out OUT --width 0.1", "width 0.1"),
+        ("train detector --out OUT --data OUT/data.yaml", "data.yaml: no such file"),
+        ("train detector --out OUT --from OUT/detector.onnx", "detector.onnx: no such file"),
+        ("train detector --out OUT --classes whale", "give --data as well"),
+        ("train assigner --out OUT --loss nope", "loss 'nope'"),
+    ],
+)
+def test_what_is_of_no_use_is_told_in_one_line(tmp_path: Path, words: str, message: str) -> None:
+    result = CliRunner().invoke(app, [word.replace("OUT", str(tmp_path / "out")) for word in words.split()])
+    assert result.exit_code == UNUSABLE
+    assert message in result.stderr
+    assert result.stderr.count("\n") == 1
+
+
 @pytest.mark.timeout(240)
 def test_the_smoke_run_of_the_command_line_leaves_a_model_that_loads(tmp_path: Path) -> None:
     data = render_dataset(tmp_path / "own", 2, seed=5, side=(160, 120))
     words = ["train", "detector", "--smoke", "--width", "0.5", "--data", str(data)]
     result = CliRunner().invoke(app, [*words, "--out", str(tmp_path / "run")])
     assert result.exit_code == 0, result.output
-    assert "2 pictures of your own" in result.output
+    assert re.search(r"2 pictures of your own with [1-9]\d* animals", result.output)
     assert "at most" in result.output, "the export was held against torch"
     model = Detector(tmp_path / "run" / "smoke" / "detector.onnx")
     assert model.input_size == (320, 320)

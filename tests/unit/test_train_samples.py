@@ -8,8 +8,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tools.train.detector.photographs import empty_seas, photograph_sample
-from tools.train.detector.pictures import own_pictures
+from tools.errors import UnusableError
+from tools.train.detector.labels import read_labels
+from tools.train.detector.own import own_pictures
+from tools.train.detector.photographs import _window, empty_seas, photograph_sample
 from tools.train.detector.samples import (
     SCENES_VERSION,
     Sample,
@@ -31,17 +33,48 @@ def test_files_are_ordered_by_number_and_every_fifth_is_held_out() -> None:
     assert not set(kept) & set(out)
 
 
-def test_a_bad_label_or_picture_is_named(tmp_path: Path) -> None:
-    picture = tmp_path / "a.png"
-    cv2.imwrite(str(picture), np.zeros((10, 20, 3), np.uint8))
-    (tmp_path / "a.txt").write_text("0 0.5 0.5 0.2\n")
-    with pytest.raises(ValueError, match=r"a\.txt.*0\.5 0\.5 0\.2"):
-        read_yolo([picture], tmp_path)
-    (tmp_path / "a.txt").write_text("0 0.5 0.5 0.2 0.4\n")
-    np.testing.assert_allclose(read_yolo([picture], tmp_path)[0].boxes, [[8, 3, 12, 7, 1]], atol=1e-5)
+def test_a_picture_of_no_use_is_named(tmp_path: Path) -> None:
     (tmp_path / "b.jpg").write_text("no picture")
-    with pytest.raises(ValueError, match=r"b\.jpg"):
+    with pytest.raises(UnusableError, match=r"b\.jpg: not a picture"):
         read_yolo([tmp_path / "b.jpg"], tmp_path)
+    cv2.imwrite(str(tmp_path / "a.png"), np.zeros((31, 90, 3), np.uint8))
+    with pytest.raises(UnusableError, match=r"a\.png: 90x31 px.*32"):
+        read_yolo([tmp_path / "a.png"], tmp_path)
+
+
+def test_labels_are_boxes_or_polygons_with_or_without_blank_lines_and_a_byte_order_mark(
+    tmp_path: Path,
+) -> None:
+    label = tmp_path / "a.txt"
+    assert read_labels(label, (200, 100)).shape == (0, 5), "no file, no animal"
+    label.write_text("\ufeff0 0.5 0.5 0.2 0.4\n\n1 0.1 0.2 0.3 0.2 0.2 0.6\n  \n", encoding="utf-8")
+    boxes = [[80, 30, 120, 70, 1], [20, 20, 60, 60, 1]]
+    np.testing.assert_allclose(read_labels(label, (200, 100)), boxes, atol=1e-4)
+    np.testing.assert_allclose(read_labels(label, (200, 100), {0: False, 1: True}), boxes[1:], atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("0 0.5 0.5 0.2", "neither"),
+        ("0 0.5 0.5 0.2 0.2 0.9", "neither"),
+        ("0 0.5 0.5 wide 0.2", "no number"),
+        ("0.5 0.5 0.5 0.2 0.2", "class 0.5"),
+        ("nan 0.5 0.5 0.2 0.2", "class nan"),
+        ("7 0.5 0.5 0.2 0.2", "class 7 is none of the data set's: 0"),
+        ("0 0.5 0.5 0 0", "under 1 px"),
+        ("0 0.5 0.5 0.2 0.001", "under 1 px"),
+        ("0 0.1 0.1 0.1 0.1 0.1 0.1", "under 1 px"),
+        ("0 0.5 0.5 nan 0.2", "shares"),
+        ("0 0.5 0.5 inf 0.2", "shares"),
+        ("0 0.5 0.5 -0.2 0.2", "shares"),
+        ("0 120 80 40 20", "shares"),
+    ],
+)
+def test_a_label_of_no_use_is_refused_with_its_file_and_line(tmp_path: Path, line: str, message: str) -> None:
+    (tmp_path / "a.txt").write_text(f"0 0.5 0.5 0.2 0.4\n{line}\n")
+    with pytest.raises(UnusableError, match=rf"a\.txt: line 2 '{line}': .*{message}"):
+        read_labels(tmp_path / "a.txt", (200, 100), {0: True})
 
 
 def marked(seed: int, width: int, height: int) -> Sample:
@@ -81,6 +114,13 @@ def test_samples_keep_boxes_on_their_animals(seed: int, rendered: bool) -> None:
             assert np.median(sample.image[y0:y1, x0:x1]) > 120
 
 
+def test_an_enlarged_photograph_fills_its_window_to_the_rim() -> None:
+    photo = Sample(np.full((150, 210, 3), 200, np.uint8), np.zeros((0, 5), np.float32))
+    for seed in range(20):
+        window = _window(photo, np.random.default_rng(seed), (320, 320), 60.0)
+        assert (window.image == 200).all(), "nothing is left to what lay in memory before"
+
+
 def test_augmentation_keeps_the_shape_and_repeats_for_the_same_generator() -> None:
     image = marked(0, 64, 48).image[:48, :64]
     for seed in range(30):
@@ -117,39 +157,83 @@ def test_rendered_animals_swim_on_a_photograph_of_water(tmp_path: Path) -> None:
     assert len(list(tmp_path.glob("train_on_photographs_0_3_*"))) == 2
 
 
-def pictures_in(folder: Path, count: int) -> None:
-    """`count` grey pictures, each with one box, in the YOLO layout below `folder`."""
-    for kind in ("images", "labels"):
-        (folder / kind / "train").mkdir(parents=True)
+def pictures_in(folder: Path, count: int, images: str = "images/train", kind: int = 0) -> None:
+    """`count` grey pictures of 60x40 px, each with one box of class `kind`, in the YOLO layout."""
+    labels = images.replace("images", "labels")
+    for name in (images, labels):
+        (folder / name).mkdir(parents=True)
     for index in range(count):
-        cv2.imwrite(str(folder / "images" / "train" / f"{index}.png"), np.full((20, 30, 3), 90, np.uint8))
-        (folder / "labels" / "train" / f"{index}.txt").write_text("3 0.5 0.5 0.2 0.4\n")
+        cv2.imwrite(str(folder / images / f"{index}.png"), np.full((40, 60, 3), 90, np.uint8))
+        (folder / labels / f"{index}.txt").write_text(f"{kind} 0.5 0.5 0.2 0.4\n")
 
 
 @pytest.mark.parametrize(
     "text",
     [
         "path: .\ntrain: images/train\nnames:\n  0: whale\n",
-        "train: 'images/train'  # mine\nval: images/train\nnc: 4\n",
-        "train: [images/train]\n",
-        "train:\n  - images/train\nnames: [a, b]\n",
-        "path: sub/..\ntrain: list.txt\n",
+        "train: 'images/train'  # mine\nval: images/train\nnc: 1\n",
+        "---\ntrain: [images/train]\nnames: ['whale']\n",
+        "train:\n  - images/train\nnames: [\n  whale  # all of them\n]\ndownload: |\n  import os\n",
+        "path: sub/..\ntrain: list.txt\nnames:\n- whale\n",
+        "{path: ., train: images/train, names: {0: whale}}",
+        "\ufefftrain: images\nnames: {0: whale}\n",
+        "names:\n- 'whale'\nnc: 1\ntrain: ../images/train\nval: ../valid/images\n",
     ],
 )
 def test_own_pictures_are_found_however_the_data_file_names_them(tmp_path: Path, text: str) -> None:
     pictures_in(tmp_path, 2)
     (tmp_path / "sub").mkdir()
     (tmp_path / "list.txt").write_text("images/train/0.png\n\nimages/train/1.png\n")
-    (tmp_path / "data.yaml").write_text(text)
+    (tmp_path / "data.yaml").write_text(text, encoding="utf-8")
     samples = own_pictures(tmp_path / "data.yaml")
     assert len(samples) == 2
-    np.testing.assert_allclose(samples[0].boxes, [[12, 6, 18, 14, 1]], atol=1e-5)
+    np.testing.assert_allclose(samples[0].boxes, [[24, 12, 36, 28, 1]], atol=1e-5)
 
 
-def test_a_data_file_that_names_no_pictures_is_refused_with_the_remedy(tmp_path: Path) -> None:
-    for text, message in (("names:\n  0: whale\n", "no entry 'train'"), ("train: nowhere\n", "no JPEG")):
-        (tmp_path / "data.yaml").write_text(text)
-        with pytest.raises(ValueError, match=message):
-            own_pictures(tmp_path / "data.yaml")
-    with pytest.raises(ValueError, match="no such file"):
+def test_own_pictures_may_lie_in_subfolders_and_be_of_other_kinds(tmp_path: Path) -> None:
+    pictures_in(tmp_path, 2, "train/images/day/one")
+    for suffix in (".webp", ".tif"):
+        picture = (tmp_path / "train/images/day/one/1.png").with_suffix(suffix)
+        cv2.imwrite(str(picture), np.full((40, 60, 3), 90, np.uint8))
+    (tmp_path / "train/images/._0.png").write_text("what other systems leave")
+    (tmp_path / "data.yaml").write_text("train: ../train/images\nnames: [whale]\n")
+    assert [len(sample.boxes) for sample in own_pictures(tmp_path / "data.yaml")] == [1, 1, 1, 1]
+
+
+def test_where_there_are_several_classes_somebody_must_say_which_are_whales(tmp_path: Path) -> None:
+    pictures_in(tmp_path, 1, kind=0)
+    pictures_in(tmp_path, 1, "more/images", kind=1)
+    data = tmp_path / "data.yaml"
+    data.write_text("train: [images/train, more/images]\nnames: [boat, whale]\n")
+    with pytest.raises(UnusableError, match=r"2 classes.*--classes .*0 boat, 1 whale"):
+        own_pictures(data)
+    for classes in (["whale"], ["1"]):
+        assert [len(sample.boxes) for sample in own_pictures(data, classes)] == [0, 1]
+    assert [len(sample.boxes) for sample in own_pictures(data, ["boat", "1"])] == [1, 1]
+    with pytest.raises(UnusableError, match="no class 'orca'; there are: 0 boat, 1 whale"):
+        own_pictures(data, ["orca"])
+    data.write_text("train: images/train\nnc: 2\n")
+    with pytest.raises(UnusableError, match="2 classes"):
+        own_pictures(data)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("names:\n  0: whale\n", "no entry 'train'"),
+        ("train: nowhere\nnames: [whale]\n", r"no pictures \(.jpg.*nowhere"),
+        ("train: bare/images\nnames: [whale]\n", "none of its 1 pictures has a label file in .*bare/labels"),
+        ("train: bare/images\n", "no entry 'names'"),
+        ("train: bare/images\nnames: [whale\n", "has no end"),
+        ("train: bare/images\nnc: some\n", "nc is 'some'"),
+        ("\x89PNG", "not 'key: value'"),
+    ],
+)
+def test_a_data_file_of_no_use_is_refused_with_the_remedy(tmp_path: Path, text: str, message: str) -> None:
+    (tmp_path / "bare" / "images").mkdir(parents=True)
+    cv2.imwrite(str(tmp_path / "bare" / "images" / "0.png"), np.full((40, 60, 3), 90, np.uint8))
+    (tmp_path / "data.yaml").write_text(text)
+    with pytest.raises(UnusableError, match=rf"data\.yaml: .*{message}"):
+        own_pictures(tmp_path / "data.yaml")
+    with pytest.raises(UnusableError, match=r"none\.yaml: no such file"):
         own_pictures(tmp_path / "none.yaml")

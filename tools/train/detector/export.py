@@ -14,6 +14,7 @@ from onnxruntime.quantization import CalibrationDataReader, QuantFormat, QuantTy
 from onnxruntime.quantization.shape_inference import quant_pre_process
 
 from procs.detector.yolo import open_session
+from tools.errors import UnusableError
 from tools.train.detector.model import STRIDES, Exported, WhaleDetector
 from tools.train.detector.pictures import Batches, Mixture
 
@@ -54,8 +55,10 @@ def export(network: WhaleDetector, path: Path, side: int) -> Path:
 def load_weights(network: WhaleDetector, path: Path) -> None:
     """Put the weights of `path` into `network`: an ONNX file that `export` wrote, or a trainer's checkpoint.
 
-    Raises ValueError where they are not those of this network.
+    Raises UnusableError where they are not those of this network.
     """
+    if not path.is_file():
+        raise UnusableError(f"{path}: no such file; give a detector.onnx or checkpoint.pt of this trainer")
     try:
         if path.suffix == ".onnx":
             model = onnx.load(str(path))
@@ -70,7 +73,7 @@ def load_weights(network: WhaleDetector, path: Path) -> None:
         counters = {name: value for name, value in network.state_dict().items() if value.ndim == 0}
         network.load_state_dict({**counters, **state})
     except Exception as error:  # onnx, pickle, torch: each has errors of its own
-        raise ValueError(
+        raise UnusableError(
             f"{path}: no weights of this network (is --width the same?): {str(error)[:300]}"
         ) from error
 
@@ -108,7 +111,7 @@ class _TrainingPictures(CalibrationDataReader):  # type: ignore[misc]
     """Training pictures for the ranges of a quantised network's values."""
 
     def __init__(self, pictures: Mixture, cache: Path, count: int) -> None:
-        batches = Batches(pictures, cache, None, max(count // pictures.batch, 1))
+        batches = Batches(pictures, cache, steps=max(count // pictures.batch, 1))
         self._images = (
             image.permute(2, 0, 1)[None].float().div(255).numpy()
             for index in range(len(batches))

@@ -38,7 +38,9 @@ def _window(
                 break
             shift = rng.uniform(0, 1, 2) * room
     canvas = np.empty((height, width, 3), np.uint8)
-    return Sample(canvas, place(photo, canvas, scale, (float(shift[0]), float(shift[1]))))
+    # An enlarged picture ends half a pixel short of the rim.
+    boxes = place(photo, canvas, scale, (float(shift[0]), float(shift[1])), cv2.BORDER_REPLICATE)
+    return Sample(canvas, boxes)
 
 
 def empty_seas(photos: Sequence[Sample], least_px: int = 260) -> list[Image]:

@@ -26,7 +26,7 @@ from tools.train.detector.samples import (
     scene_sample,
 )
 
-__all__ = ["Batches", "Mixture", "own_pictures", "photographs"]
+__all__ = ["Batches", "Mixture", "photographs"]
 
 ENDLESS = 100_000_000  # batches; the trainer stops before
 CLUTTER, CLUTTER_WHALE_PX = 2.0, (20.0, 200.0)  # times the scenes' chances; beside whales of such lengths
@@ -53,12 +53,13 @@ class Mixture:
 class Batches(torch.utils.data.Dataset[tuple[torch.Tensor, list[torch.Tensor]]]):
     """Batch number k: images (B, side, side, 3) uint8 RGB, and (N, 5) boxes an image; of (seed, k) alone."""
 
-    def __init__(self, mixture: Mixture, cache: Path, data: Path | None, steps: int = ENDLESS) -> None:
-        self.mixture, self.steps = mixture, steps
+    def __init__(
+        self, mixture: Mixture, cache: Path, own: Sequence[Sample] = (), steps: int = ENDLESS
+    ) -> None:
+        self.mixture, self.own, self.steps = mixture, own, steps
         self.photographs = photographs()
         self.rendered = _rendered(cache, mixture, has_seas=bool(_seas(self.photographs)))
         self.empty = [sample for sample in self.rendered if len(sample.boxes) == 0]
-        self.own = own_pictures(data) if data is not None else []
 
     def __len__(self) -> int:
         return self.steps
@@ -137,56 +138,3 @@ def photographs() -> list[Sample]:
         box = np.array([[82, 256, 1080, 544, 1]], np.float32)
         photos.append(Sample(np.asarray(small, np.uint8), box))
     return photos
-
-
-def own_pictures(data_yaml: Path, part: str = "train") -> list[Sample]:
-    """The pictures that `part` of a YOLO data.yaml names, whose labels lie in labels/ beside images/.
-
-    The entry is a folder, a text file that lists pictures, or a list of either. Every class counts as the one
-    that the network knows. Raises ValueError naming what is wrong.
-    """
-    if not data_yaml.is_file():
-        raise ValueError(f"{data_yaml}: no such file; give the data.yaml of a YOLO data set")
-    entries = _entries(data_yaml.read_text())
-    if not entries.get(part):
-        raise ValueError(f"{data_yaml}: has no entry {part!r}; it must name the folder of its pictures")
-    root = data_yaml.parent / (entries.get("path") or ["."])[0]
-    found = [path for name in entries[part] for path in _listed(root, name)]
-    if not found:
-        raise ValueError(f"{data_yaml}: no JPEG, PNG or BMP pictures in {root / entries[part][0]}")
-    samples: list[Sample] = []
-    for folder in sorted({path.parent for path in found}):
-        samples += read_yolo([path for path in found if path.parent == folder], _labels_beside(folder))
-    return samples
-
-
-def _entries(text: str) -> dict[str, list[str]]:
-    """What stands under each key at the left border of a data.yaml: one text, or the items of a list."""
-    entries: dict[str, list[str]] = {}
-    key = ""
-    for line in text.splitlines():
-        line = line.split(" #")[0].rstrip()
-        item = line.strip()
-        if item.startswith("- ") and key:
-            entries[key].append(item[2:].strip().strip("'\""))
-        elif line and not line.startswith((" ", "#", "-")) and ":" in line:
-            key, _, value = (part.strip() for part in line.partition(":"))
-            items = value.strip("[]").split(",") if value else []
-            entries[key] = [item.strip().strip("'\"") for item in items]
-    return entries
-
-
-def _listed(root: Path, name: str) -> Sequence[Path]:
-    """The pictures of a folder, or of a text file with one picture a line."""
-    place = (root / name).resolve()
-    if place.suffix == ".txt" and place.is_file():
-        lines = [line.strip() for line in place.read_text().splitlines()]
-        return [(root / line).resolve() for line in lines if line]
-    return sorted(p for p in place.glob("*") if p.suffix.lower() in (".jpg", ".jpeg", ".png", ".bmp"))
-
-
-def _labels_beside(images: Path) -> Path:
-    """labels/ in the place of the last images/ of a path; the same folder where it has none."""
-    parts = list(images.parts)
-    where = max((index for index, part in enumerate(parts) if part == "images"), default=-1)
-    return Path(*parts[:where], "labels", *parts[where + 1 :]) if where >= 0 else images

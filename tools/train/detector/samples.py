@@ -5,7 +5,7 @@ animal is too faint or too far outside to be learnt either way.
 """
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,7 +23,9 @@ from drivers.sim.render.effects import (
     noisy,
     vignetted,
 )
+from tools.errors import UnusableError
 from tools.render import measured_right_whales, scenes
+from tools.train.detector.labels import read_labels
 
 __all__ = [
     "SCENES_VERSION",
@@ -51,6 +53,7 @@ CACHE_SIDE = 384  # a little over the network's 320, so that crops and scales va
 WITH_EXTRAS = ("w_6", "w_23", "w_33", "w_94")
 PAD_GREY = 114  # what the detector puts round pictures that are not square
 SCENES_VERSION = 2  # raised whenever the scenes change: what was kept of older ones is left alone
+LEAST_PICTURE_PX = 32  # what is left of smaller ones is no picture
 LEAST_SHARE = 0.35  # of a box that a crop must keep for the animal to count
 
 
@@ -117,30 +120,25 @@ def cached_scenes(
     return [Sample(images[index], all_boxes[owner_of == index]) for index in range(len(images))]
 
 
-def read_yolo(images: Sequence[Path], labels: Path) -> list[Sample]:
-    """Pictures with YOLO text labels (class x y w h, shares of the picture); no file there means no animal.
+def read_yolo(
+    images: Sequence[Path], labels: Path, counted: Mapping[int, bool] | None = None
+) -> list[Sample]:
+    """Pictures with YOLO text labels (see `read_labels`) of the same names in the folder `labels`.
 
-    Raises ValueError naming a picture that cannot be read or a label line that is not five numbers.
+    Raises UnusableError naming a picture that cannot be read or is too small, or a label line of no use.
     """
     samples = []
     for path in images:
         image = cv2.imread(str(path), cv2.IMREAD_COLOR)
         if image is None:
-            raise ValueError(f"{path}: not a picture that OpenCV reads; remove it or replace it")
+            raise UnusableError(f"{path}: not a picture that OpenCV reads; remove it or replace it")
         height, width = image.shape[:2]
-        label_path, boxes = labels / f"{path.stem}.txt", []
-        for line in label_path.read_text().splitlines() if label_path.is_file() else []:
-            try:
-                _, x, y, w, h = (float(value) for value in line.split())
-            except ValueError:
-                raise ValueError(
-                    f"{label_path}: line {line!r} is not 'class x y w h'; five numbers are needed"
-                ) from None
-            boxes.append(
-                [(x - w / 2) * width, (y - h / 2) * height, (x + w / 2) * width, (y + h / 2) * height, 1.0]
+        if min(width, height) < LEAST_PICTURE_PX:
+            raise UnusableError(
+                f"{path}: {width}x{height} px; a picture needs {LEAST_PICTURE_PX} px a side; remove it"
             )
-        table = np.array(boxes, np.float32).reshape(-1, 5)
-        samples.append(_with_halves(np.asarray(image, np.uint8), table, path.stem))
+        boxes = read_labels(labels / f"{path.stem}.txt", (width, height), counted)
+        samples.append(_with_halves(np.asarray(image, np.uint8), boxes, path.stem))
     return samples
 
 
@@ -163,13 +161,19 @@ def row(values: list[float]) -> Boxes:
     return np.array(values, np.float32)
 
 
-def place(sample: Sample, canvas: Image, scale: float, shift: tuple[float, float]) -> Boxes:
+def place(
+    sample: Sample,
+    canvas: Image,
+    scale: float,
+    shift: tuple[float, float],
+    border: int = cv2.BORDER_TRANSPARENT,
+) -> Boxes:
     """Draw the picture at `scale` with its corner at `shift` (u, v) onto the canvas; its boxes there,
-    clipped.
+    clipped. border: OpenCV's word for what lies outside the picture.
     """
     height, width = canvas.shape[:2]
     move = np.array([[scale, 0, shift[0]], [0, scale, shift[1]]])
-    cv2.warpAffine(sample.image, move, (width, height), dst=canvas, borderMode=cv2.BORDER_TRANSPARENT)
+    cv2.warpAffine(sample.image, move, (width, height), dst=canvas, borderMode=border)
     return clipped(sample.boxes * row([scale] * 4 + [1]) + row([*shift, *shift, 0]), (0, 0, width, height))
 
 

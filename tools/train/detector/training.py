@@ -12,7 +12,7 @@ device is used where there is one.
 """
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
@@ -22,9 +22,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from tools.errors import UnusableError
 from tools.train.detector.export import check_export, export, load_weights, quantise
 from tools.train.detector.loss import detection_loss
 from tools.train.detector.model import Sizes, WhaleDetector, cell_centres, decode
+from tools.train.detector.own import own_pictures
 from tools.train.detector.pictures import Batches, Mixture
 
 __all__ = ["Settings", "averaged", "command", "settings_of", "train"]
@@ -94,7 +96,9 @@ class _Run:
         """Take up a checkpoint; says where its settings were others: the run cannot be repeated then."""
         state = torch.load(path, weights_only=True, map_location=self.device)
         if state["width"] != settings.width:
-            raise ValueError(f"{path}: of width {state['width']}, not {settings.width}; choose another --out")
+            raise UnusableError(
+                f"{path}: of width {state['width']}, not {settings.width}; choose another --out"
+            )
         for name, now in asdict(settings).items():
             before = state["settings"].get(name)
             if before != str(now):
@@ -141,20 +145,17 @@ def train(
     data: Path | None = None,
     begin_from: Path | None = None,
     stop_after: int | None = None,
+    classes: Sequence[str] = (),
 ) -> Path:
     """Train into the folder `out`, from its checkpoint if there is one, export, return the ONNX file's path.
 
-    `stop_after` ends the run at that step, as a kill would; the next call goes on from the last checkpoint.
+    data: the data.yaml of your own pictures, `classes` those of its classes that count. `stop_after` ends the
+    run at that step, as a kill would; the next call goes on from the last checkpoint.
     """
     cv2.setNumThreads(1)
     torch.set_num_threads(settings.threads)
-    out.mkdir(parents=True, exist_ok=True)
-    batches = Batches(settings.pictures, out.parent / "detector_scenes", data)
-    print(
-        f"{len(batches.rendered)} rendered scenes ({len(batches.empty)} empty), "
-        f"{len(batches.photographs)} photographs, {len(batches.own)} pictures of your own",
-        flush=True,
-    )
+    # What was given is read before minutes are spent on rendering.
+    own = own_pictures(data, classes) if data is not None else []
     run, checkpoint = _Run(settings), out / "checkpoint.pt"
     if checkpoint.is_file():
         run.load(checkpoint, settings)
@@ -162,6 +163,14 @@ def train(
     elif begin_from is not None:
         run.begin_from(begin_from, settings.rate_from)
         print(f"begins from {begin_from}", flush=True)
+    out.mkdir(parents=True, exist_ok=True)
+    batches = Batches(settings.pictures, out.parent / "detector_scenes", own)
+    print(
+        f"{len(batches.rendered)} rendered scenes ({len(batches.empty)} empty), "
+        f"{len(batches.photographs)} photographs, {len(own)} pictures of your own "
+        f"with {sum(len(sample.boxes) for sample in own)} animals",
+        flush=True,
+    )
     run.network.train()
     sums, begun = np.zeros(2), time.monotonic() - run.seconds
     for images, boxes in _from(batches, run.step, settings.workers):
@@ -245,9 +254,9 @@ def _report(run: _Run, settings: Settings, losses: NDArray[np.float64], log: Pat
 def settings_of(
     width: float, steps: int | None, minutes: float | None, seed: int, threads: int = 1
 ) -> Settings:
-    """The usual settings but for what the command line names. Raises ValueError for a width of no use."""
+    """The usual settings but for what the command line names. Raises UnusableError for a width of no use."""
     if not 0.25 <= width <= 2.0:
-        raise ValueError(f"width {width}: must lie between 0.25 and 2; 1 is the network that ships")
+        raise UnusableError(f"width {width}: must lie between 0.25 and 2; 1 is the network that ships")
     chosen = Settings(pictures=Mixture(seed=seed), width=width, minutes=minutes, threads=threads)
     return chosen if steps is None else replace(chosen, steps=steps)
 
@@ -259,8 +268,11 @@ def command(
     begin_from: Path | None = None,
     smoke: bool = False,
     int8: bool = False,
+    classes: Sequence[str] = (),
 ) -> None:
     """Train into OUT and export OUT/detector.onnx; smoke: a few steps and the check of the export."""
+    if classes and data is None:
+        raise UnusableError("--classes says which classes of --data count; give --data as well")
     if smoke:
         out = out / "smoke"
         (out / "checkpoint.pt").unlink(missing_ok=True)  # always from the beginning
@@ -276,7 +288,7 @@ def command(
             workers=0,
         )
     begun = time.monotonic()
-    model = train(out, settings, data, begin_from)
+    model = train(out, settings, data, begin_from, classes=classes)
     print(f"{model}: {check_export(averaged(out), model, settings.pictures.side)}")
     if int8:
         cache = out.parent / "detector_scenes"
