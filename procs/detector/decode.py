@@ -11,8 +11,13 @@ __all__ = ["Candidates", "Layout", "ModelError", "best_first", "decode", "layout
 
 MOST_BOXES = 300  # far above any pod
 MOST_CANDIDATES = 1000  # compared with each other: bounds the time that a shouting network can cost
-MOST_REFUSED_SHARE = 0.5  # of the output's rows that may be no numbers before the model counts as broken
+MOST_REFUSED_SHARE = 0.5  # of an output's rows that may be odd before the model counts as broken
 MOST_SCORE = 1.01  # half precision rounds up; a score above that was never a probability
+MOST_FINISHED_ROWS = 3000  # ten times what any exporter keeps where overlaps are gone
+YOLOV5 = (
+    "centre, size, objectness and a score a class, as YOLOv5 exports; train a yolov5nu or a later model with "
+    "Ultralytics 8 or newer and export that"
+)
 NORMALISED_BELOW = 2.0  # no finished box in pixels has all its numbers below this
 
 
@@ -59,6 +64,8 @@ def layout_of(
         if "DETR" in head.upper():
             if columns == 6 or columns == 4 + (class_count or 0):
                 return Layout("queries")
+        elif task is None and columns in (6, 7) and rows > MOST_FINISHED_ROWS:
+            raise ValueError(f"output shape {tuple(shape)} is {YOLOV5}")
         elif columns == 7 and task != "detect":
             return Layout("finished", oriented=True)
         elif columns == 6 and not oriented:
@@ -80,7 +87,7 @@ def decode(
 ) -> Candidates:
     """The rows of `output` above `confidence`, in px of the network's input of `size` (width, height).
 
-    Raises ModelError where most rows are no numbers, or the boxes are no pixels.
+    Raises ModelError where most rows are no numbers, most scores are above 1, or the boxes are no pixels.
     """
     with np.errstate(invalid="ignore", over="ignore"):  # what comes of infinities is NaN, and is left out
         if layout.kind == "raw":
@@ -112,6 +119,7 @@ def _finished(output: NDArray[np.float32], oriented: bool, confidence: float) ->
     else:
         found = Candidates(rows[:, :4], rows[:, 4], classes)
     found = _sound(found, output.shape[1])
+    _refuse_yolov5(rows, oriented)
     if len(found.scores) and np.abs(found.boxes).max() < NORMALISED_BELOW:
         raise ModelError(
             f"the boxes lie between {found.boxes.min():.2f} and {found.boxes.max():.2f}: shares of the "
@@ -119,6 +127,18 @@ def _finished(output: NDArray[np.float32], oriented: bool, confidence: float) ->
             "in the metadata that its head is RT-DETR"
         )
     return found
+
+
+def _refuse_yolov5(rows: NDArray[np.float32], oriented: bool) -> None:
+    """ModelError where most of a finished output's rows above the confidence have no class or no corners."""
+    odd = np.nan_to_num(rows[:, 5]) % 1 != 0
+    if not oriented:
+        odd |= np.any(rows[:, 2:4] < rows[:, :2], axis=1)
+    if np.count_nonzero(odd) > MOST_REFUSED_SHARE * len(rows):
+        raise ModelError(
+            f"{np.count_nonzero(odd)} of {len(rows)} rows above the confidence have a class that is no whole "
+            f"number, or a right side left of the left one: the output is {YOLOV5}"
+        )
 
 
 def _queries(output: NDArray[np.float32], confidence: float, size: tuple[int, int]) -> Candidates:
@@ -151,15 +171,23 @@ def _upright(
 
 
 def _sound(found: Candidates, total: int) -> Candidates:
-    """Without rows that are no numbers or no scores; ModelError when they are most of `total`."""
+    """Without rows that are no numbers or no scores; ModelError when they are most of `total`, or when most
+    of those above the confidence have scores above 1.
+    """
     # A sum is no number where any of its parts is none, and a greatest score is NaN where any of them is.
     if np.isfinite(found.boxes.sum()) and found.scores.max(initial=0) <= MOST_SCORE:
         return found
+    n_loud = int(np.count_nonzero(np.isfinite(found.scores) & (found.scores > MOST_SCORE)))
+    if n_loud > MOST_REFUSED_SHARE * len(found.scores):
+        raise ModelError(
+            f"{n_loud} of {len(found.scores)} rows above the confidence have scores above 1, as logits or "
+            "percents; export the model again, with its scores from 0 to 1"
+        )
     good = np.isfinite(found.boxes.sum(axis=1)) & (found.scores <= MOST_SCORE)
     n_refused = len(good) - int(np.count_nonzero(good))
     if n_refused > MOST_REFUSED_SHARE * total:
         raise ModelError(
-            f"{n_refused} of {total} rows of the output are NaN, infinite, or scores above 1; export the "
+            f"{n_refused} of {total} rows of the output are NaN, infinite or scores above 1; export the "
             "model again, in float32 and with its scores from 0 to 1"
         )
     return found.take(good)

@@ -43,6 +43,7 @@ def table(*rows: tuple[float, ...], count: int = 300) -> np.ndarray:
         ((1, 300, 6), 2, "detect", "RTDETRDecoder", Layout("queries")),
         ((1, 5, 2100), None, None, "", Layout("raw")),
         ((1, 300, 6), None, None, "", Layout("finished")),
+        ((1, 5000, 6), 1, "detect", "", Layout("finished")),  # nms=True, max_det=5000
     ],
 )
 def test_a_layout_is_told_by_head_then_last_dimension_then_first(
@@ -56,6 +57,9 @@ def test_a_layout_is_told_by_head_then_last_dimension_then_first(
     [
         ((1, 8400, 84), 80, "detect", ""),  # on its side
         ((1, 25200, 85), 80, "detect", ""),  # v5: with an objectness
+        ((1, 25200, 6), 1, None, ""),
+        ((1, 6300, 7), 2, None, ""),
+        ((1, 25200, 7), None, None, ""),
         ((1, 8400, 84), None, None, ""),
         ((1, 85, 8400), 80, "detect", ""),
         ((1, 84, 8400), 80, "obb", ""),
@@ -74,6 +78,37 @@ def test_any_other_layout_is_an_error_that_names_the_shape(
     with pytest.raises(ValueError) as caught:
         layout_of(shape, class_count, task, head)
     assert str(shape) in str(caught.value)
+
+
+def yolov5(n_classes: int, rows: int, seed: int) -> np.ndarray:
+    """(1, rows, 5 + n_classes): centre, size, objectness, a score a class; a tenth of the cells see much."""
+    random = np.random.default_rng(seed)
+    output = np.empty((1, rows, 5 + n_classes), np.float32)
+    output[0, :, :2] = random.uniform(0, 64, (rows, 2))
+    output[0, :, 2:4] = random.uniform(4, 20, (rows, 2))
+    output[0, :, 4:] = random.uniform(0, 0.1, (rows, 1 + n_classes))
+    output[0, ::10, 4:] += 0.8
+    return output
+
+
+@pytest.mark.parametrize("classes", [1, 2])
+def test_a_yolov5_is_named_with_the_remedy(tmp_path: Path, classes: int) -> None:
+    """At the start where it has thousands of rows, else with the first animal."""
+    names = {"names": TWO["names"] if classes == 2 else NAMES["names"]}
+    large = network(tmp_path / "large.onnx", yolov5(classes, 25200, 1), names)
+    with pytest.raises(ModelError, match=r"large\.onnx: output shape .*YOLOv5 .*train a yolov5nu or a later"):
+        Detector(large)
+    small = network(tmp_path / "small.onnx", yolov5(classes, 252, 2), {**names, "imgsz": "64"})
+    with pytest.raises(ModelError, match=r"small\.onnx: 2\d of 26 rows .*YOLOv5 .*train a yolov5nu"):
+        Detector(small).detect(PICTURE)
+
+
+def test_a_yolov5_of_one_class_whose_score_is_always_1_is_named_too(tmp_path: Path) -> None:
+    """With one class its score is not trained: half precision makes it 1, which looks like a class."""
+    output = yolov5(1, 252, 3)
+    output[..., 5] = 1
+    with pytest.raises(ModelError, match="YOLOv5"):
+        Detector(network(tmp_path / "half.onnx", output)).detect(PICTURE)
 
 
 @pytest.mark.parametrize("task", ["segment", "pose", "classify", "semantic"])
@@ -260,6 +295,15 @@ def test_scores_that_were_never_probabilities_are_refused(tmp_path: Path) -> Non
     output = np.full((1, 5, 100), 7.0, np.float32)
     with pytest.raises(ModelError, match=r"raw\.onnx: 100 of 100 rows .*scores above 1"):
         Detector(network(tmp_path / "raw.onnx", output)).detect(PICTURE)
+
+
+@pytest.mark.parametrize("score", [3.5, 90.0])
+def test_a_few_animals_with_logits_or_percents_for_scores_are_told(tmp_path: Path, score: float) -> None:
+    rows = [(20, 30, 10, 20, score), (50, 50, 6, 6, 2.0), (40, 10, 6, 6, 0.8)]
+    with pytest.raises(ModelError, match=r"raw\.onnx: 2 of 3 rows .*scores above 1, as logits or percents"):
+        Detector(network(tmp_path / "raw.onnx", raw(*rows))).detect(PICTURE)
+    odd = [(20, 30, 10, 20, score), (50, 50, 6, 6, 0.7), (40, 10, 6, 6, 0.8)]
+    assert len(Detector(network(tmp_path / "raw.onnx", raw(*odd))).detect(PICTURE)) == 2
 
 
 def test_a_shouting_network_costs_little_and_gives_no_more_than_any_pod(tmp_path: Path) -> None:
