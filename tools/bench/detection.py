@@ -129,6 +129,10 @@ def _hardness_rows(m: Measures) -> Iterator[Row]:
             if n
         ]
         yield Row(f"recall % (animals) by {title}", ours.pictures, f"val {m.seed}", ", ".join(parts))
+    clear = [a for a in ours.animals if a.long_px >= 24 and a.depth_m < 0.3 and a.contrast >= 20]
+    hits = sum(animal.score >= CONFIDENCE for animal in clear)
+    name = "recall of the clear ones: 24 px, awash, 20 grey levels"
+    yield Row(name, len(clear), f"val {m.seed}", _percent(hits / max(len(clear), 1)))
     share = ours.faint_found / max(ours.faint, 1)
     name = "too small or faint to count, found all the same"
     yield Row(name, ours.faint, f"val {m.seed}", _percent(share))
