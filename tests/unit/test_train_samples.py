@@ -1,5 +1,6 @@
 """Samples keep boxes on their animals, whatever is done to the picture; what is read from disk is checked."""
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
@@ -9,9 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tools.errors import UnusableError
+from tools.render import Scene
+from tools.train.detector import samples
 from tools.train.detector.labels import read_labels
 from tools.train.detector.own import own_pictures
 from tools.train.detector.photographs import _window, empty_seas, photograph_sample
+from tools.train.detector.pictures import photographs
 from tools.train.detector.samples import (
     SCENES_VERSION,
     Sample,
@@ -31,6 +35,17 @@ def test_files_are_ordered_by_number_and_every_fifth_is_held_out() -> None:
     kept, out = held_out(paths)
     assert [path.stem for path in out] == ["w_0", "w_11"]
     assert not set(kept) & set(out)
+
+
+def test_no_held_out_photograph_is_learnt_from(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pictures_in(tmp_path / "right_whales", 11)
+    for path in (tmp_path / "right_whales" / "images" / "train").iterdir():
+        cv2.imwrite(str(tmp_path / "right_whales" / "images" / f"w_{path.stem}.jpg"), cv2.imread(str(path)))
+    monkeypatch.setenv("PODWATCH_REAL_DATA", str(tmp_path))
+    _, out = held_out(sorted((tmp_path / "right_whales" / "images").glob("*.jpg")))
+    assert {path.stem for path in out} == {"w_0", "w_5", "w_10"}
+    learnt = {photo.name for photo in photographs()}
+    assert learnt == {f"w_{number}" for number in range(11)} - {path.stem for path in out}
 
 
 def test_a_picture_of_no_use_is_named(tmp_path: Path) -> None:
@@ -77,10 +92,13 @@ def test_a_label_of_no_use_is_refused_with_its_file_and_line(tmp_path: Path, lin
         read_labels(tmp_path / "a.txt", (200, 100), {0: True})
 
 
+LIGHTEST_WATER = 40
+
+
 def marked(seed: int, width: int, height: int) -> Sample:
-    """Dark noise with one white rectangle, which is the animal."""
+    """Dark noise, the water, with one white rectangle, which is the animal."""
     rng = np.random.default_rng(seed)
-    image = rng.integers(0, 40, (height, width, 3), dtype=np.uint8)
+    image = rng.integers(0, LIGHTEST_WATER, (height, width, 3), dtype=np.uint8)
     x, y, w, h = (
         int(rng.integers(0, width - 60)),
         int(rng.integers(0, height - 40)),
@@ -110,8 +128,8 @@ def test_samples_keep_boxes_on_their_animals(seed: int, rendered: bool) -> None:
         assert 0 <= left < right <= 96
         assert 0 <= top < bottom <= 96
         x0, y0, x1, y1 = int(left + 2), int(top + 2), int(right - 1), int(bottom - 1)
-        if x1 - x0 >= 2 and y1 - y0 >= 2:  # the animal is white, the water dark
-            assert np.median(sample.image[y0:y1, x0:x1]) > 120
+        if x1 - x0 >= 2 and y1 - y0 >= 2:
+            assert np.median(sample.image[y0:y1, x0:x1]) > 1.25 * LIGHTEST_WATER
 
 
 def test_an_enlarged_photograph_fills_its_window_to_the_rim() -> None:
@@ -137,6 +155,26 @@ def test_a_cache_that_was_cut_off_is_made_again(tmp_path: Path) -> None:
     for one, same in zip(first, again, strict=True):
         np.testing.assert_array_equal(one.image, same.image)
         np.testing.assert_array_equal(one.boxes, same.boxes)
+
+
+def test_two_trainings_that_begin_together_make_the_same_scenes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made, others = samples.scenes, []
+
+    def meanwhile(*words: object, **more: object) -> Iterator[Scene]:
+        """The other training begins while this one renders, and ends first."""
+        monkeypatch.setattr(samples, "scenes", made)
+        with monkeypatch.context() as patch:
+            patch.setattr("os.getpid", lambda: -1)
+            others.extend(cached_scenes(tmp_path, 2, 3, "train", tmp_path / "no_outlines.csv"))
+        yield from made(*words, **more)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(samples, "scenes", meanwhile)
+    ours = cached_scenes(tmp_path, 2, 3, "train", tmp_path / "no_outlines.csv")
+    for one, same in zip(ours, others, strict=True):
+        np.testing.assert_array_equal(one.image, same.image)
+    assert not list(tmp_path.glob("*.part"))
 
 
 def test_the_water_beside_an_animal_is_an_empty_sea_and_a_narrow_rim_is_none() -> None:

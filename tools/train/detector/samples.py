@@ -99,7 +99,8 @@ def cached_scenes(
     if not boxes_path.is_file():  # written last: a killed run leaves none and begins again
         folder.mkdir(parents=True, exist_ok=True)
         shape = (count, CACHE_SIDE, CACHE_SIDE, 3)
-        part = images_path.with_suffix(".part")
+        # Of this process alone: two trainings that begin together make the same scenes side by side.
+        part = images_path.with_suffix(f".{os.getpid()}.part")
         images = np.lib.format.open_memmap(part, "w+", np.uint8, shape)
         boxes, owner = [np.zeros((0, 5), np.float32)], [np.zeros(0, np.int64)]
         side = (CACHE_SIDE, CACHE_SIDE)
