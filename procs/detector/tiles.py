@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 
 from procs.detector.decode import Candidates
 
-__all__ = ["LEAST_ANIMAL_PX", "SeenLength", "Tile", "merge", "owned", "pieces", "plan"]
+__all__ = ["LEAST_ANIMAL_PX", "SeenLength", "Tile", "merge", "owned", "pieces", "plan", "shortfall"]
 
 OVERLAP = 0.25  # of a tile that its neighbour shows too; an animal nearly so long is whole where it counts
 LEAST_ANIMAL_PX = 16.0  # long side at the network's size; smaller animals are missed (docs/detector.md)
+HOPELESS_ANIMAL_PX = 8.0  # where tiles show it smaller than this, they are not worth their time
 WANTED_ANIMAL_PX = 24.0  # long side that tiles give it, where there is time
 MOST_ENLARGED = 0.5  # px of the picture for each px of the input: more enlarging shows nothing new
 UNKNOWN_SHRINK = 2.5  # a picture shrunk by more may hide small animals, where nobody knows how large they are
@@ -47,9 +48,10 @@ def plan(
 ) -> list[Tile]:
     """The tiles to look at beside the whole picture of `size`; none where they would show nothing more.
 
-    tile: their side in px; "auto" cuts where an animal's long side, `animal_px` in px of the picture, would
-    be under 16 px at `input_size`, into at most `most` tiles; None never cuts. animal_px: None where nobody
-    knows; pictures that shrink by more than 2.5 are cut then.
+    tile: their side in px, longer where there would be more than 64 of them; "auto" cuts where an animal's
+    long side, `animal_px` in px of the picture, would be under 16 px at `input_size` and tiles show it with
+    at least 8, into at most `most` tiles; None never cuts. animal_px: None where nobody knows; pictures that
+    shrink by more than 2.5 are cut then.
     """
     if tile is None:
         return []
@@ -61,15 +63,44 @@ def plan(
             wanted = shrink
         else:
             wanted = max(animal_px / WANTED_ANIMAL_PX, MOST_ENLARGED)
-        while wanted * LEAST_GAIN <= shrink:
+        hopeless = shrink if animal_px is None else animal_px / HOPELESS_ANIMAL_PX
+        while wanted * LEAST_GAIN <= shrink and wanted <= hopeless:
             sides = (int(wanted * input_size[0]), int(wanted * input_size[1]))
             tiles = _grid(size, sides)
             if len(tiles) <= min(most, MOST_TILES):
                 return tiles
             wanted *= 1.05  # fewer tiles, each of more of the picture
         return []
-    tiles = _grid(size, (tile, tile))
+    side = max(tile, int(np.sqrt(size[0] * size[1] / MOST_TILES)))  # too short even without overlap
+    while len(tiles := _grid(size, (side, side))) > MOST_TILES:
+        side += side // 20 + 1
     return tiles if len(tiles) > 1 else []
+
+
+def shortfall(
+    tiles: list[Tile],
+    size: tuple[int, int],
+    tile: int | Literal["auto"] | None,
+    input_size: tuple[int, int],
+    animal_px: float | None,
+) -> str:
+    """What people should know of the `tiles` that `plan` gave: that they are not as asked for, or that
+    animals of `animal_px` are missed all the same. "" where all is well.
+    """
+    left, top, right, bottom = tiles[0].window if tiles else (0, 0, *size)
+    side = max(right - left, bottom - top)
+    if isinstance(tile, int) and tiles and side > tile:
+        return (
+            f"tile = {tile}: more than {MOST_TILES} tiles in a picture of {size[0]} x {size[1]} px; they are "
+            f"{side} px instead; set that or more, or auto"
+        )
+    shown_px = (animal_px or np.inf) / max((right - left) / input_size[0], (bottom - top) / input_size[1])
+    if tile != "auto" or shown_px >= LEAST_ANIMAL_PX:
+        return ""
+    return (
+        f"with {len(tiles)} tiles animals are {shown_px:.0f} px long to the network, which misses them below "
+        f"{LEAST_ANIMAL_PX:.0f}; fly lower, or raise tile_limit_ms"
+    )
 
 
 def _grid(size: tuple[int, int], sides: tuple[int, int]) -> list[Tile]:

@@ -19,7 +19,7 @@ from procs.detector.decode import Candidates, ModelError, best_first, decode, su
 from procs.detector.letterbox import Letterbox
 from procs.detector.network import PROVIDERS, Names, Network, open_session
 from procs.detector.sight import Sight
-from procs.detector.tiles import SeenLength, Tile, merge, owned, pieces, plan
+from procs.detector.tiles import SeenLength, Tile, merge, owned, pieces, plan, shortfall
 
 __all__ = ["Detections", "Detector", "ModelError", "open_session"]
 
@@ -37,7 +37,7 @@ class Detections:
     names: dict[int, str]
     timings: dict[str, float] = field(default_factory=dict)  # ms: prepare, infer, decode
     n_looks: int = 1  # at the whole picture, and at its tiles
-    trouble: str = ""  # what is wrong with the picture, for people
+    trouble: str = ""  # what is wrong with the picture, or with the tiles it is cut into, for people
     n_repeats: int = 0  # pictures right before this one that were the same to the last bit
 
     def __len__(self) -> int:
@@ -106,7 +106,8 @@ class Detector:
         height, width = image.shape[:2]
         whole = self._look(image, timings, is_whole=True)
         looks = []
-        for tile in self._tiles((width, height)):
+        tiles = self._tiles((width, height))
+        for tile in tiles:
             left, top, right, bottom = tile.window
             piece = self._look(image[top:bottom, left:right], timings)
             begun = time.perf_counter()
@@ -124,6 +125,7 @@ class Detector:
         if self._tile == "auto":
             self._seen_length.see(boxes)
         timings["decode"] += (time.perf_counter() - begun) * 1e3
+        missed = shortfall(tiles, (width, height), self._tile, self.input_size, self.animal_px)
         return Detections(
             boxes,
             found.scores[real],
@@ -131,7 +133,7 @@ class Detector:
             self.names,
             timings,
             1 + len(looks),
-            self._sight.trouble,
+            "; ".join(filter(None, (self._sight.trouble, missed))),
             self._sight.n_repeats,
         )
 

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from procs.detector.decode import Candidates
-from procs.detector.tiles import SeenLength, Tile, merge, owned, pieces, plan
+from procs.detector.tiles import SeenLength, Tile, merge, owned, pieces, plan, shortfall
 from procs.detector.yolo import Detections, Detector
 from tests.unit.detector_networks import blob_network, network, raw
 
@@ -56,6 +56,38 @@ def test_auto_never_takes_more_tiles_than_there_is_time_for(most: int) -> None:
         assert len(tiles) <= max(most, 0)
         shrink = (tiles[0].window[2] - tiles[0].window[0]) / 320 if tiles else 12.0
         assert not tiles or shrink <= 12.0 / 1.2, "tiles that show nothing larger are not looked at"
+
+
+@pytest.mark.parametrize("size", [(4000, 3000), (3000, 4000), (1280, 720), (20000, 60), (33, 33)])
+def test_no_number_cuts_a_picture_into_more_than_64(size: tuple[int, int]) -> None:
+    tiles = plan(size, 32, INPUT)
+    assert (2 if size == (33, 33) else 30) < len(tiles) <= 64
+    said = shortfall(tiles, size, 32, INPUT, None)
+    side = tiles[0].window[2]
+    if size == (33, 33):
+        assert (side, said) == (32, "")
+        return
+    assert (
+        f"tile = 32: more than 64 tiles in a picture of {size[0]} x {size[1]} px; they are {side} px" in said
+    )
+    assert plan(size, side, INPUT) == tiles
+    assert shortfall(tiles, size, side, INPUT, None) == ""
+
+
+def test_animals_that_stay_too_small_are_told_and_hopeless_ones_cost_no_time() -> None:
+    """Seven looks at 3840 x 2160 px are six tiles that show 20 px as 4, 60 px as 12, 100 px as 21."""
+    size = (3840, 2160)
+    for animal_px, n_tiles, words in (
+        (20.0, 0, "with 0 tiles animals are 2 px long to the network"),
+        (60.0, 6, "with 6 tiles animals are 12 px long to the network, which misses them below 16"),
+        (100.0, 6, ""),
+        (None, 6, ""),
+    ):
+        tiles = plan(size, "auto", INPUT, animal_px, 7)
+        said = shortfall(tiles, size, "auto", INPUT, animal_px)
+        assert (len(tiles), bool(said)) == (n_tiles, bool(words)), (animal_px, said)
+        assert words in said
+    assert shortfall([], size, None, INPUT, 20.0) == "", "who switched it off knows"
 
 
 def test_tiles_have_the_proportions_of_the_networks_input() -> None:
@@ -229,4 +261,6 @@ def test_auto_stays_within_its_time(tmp_path: Path) -> None:
     for limit_ms, most in ((1000.0, 65), (100.0, 10), (25.0, 2), (10.0, 1)):
         detector = Detector(model, tile="auto", tile_limit_ms=limit_ms, look_ms=10.0)
         detector.animal_px = 20.0
-        assert 1 <= seen_at(detector, [(40, 60, 60, 70)], (640, 480)).n_looks <= most
+        found = seen_at(detector, [(40, 60, 60, 70)], (640, 480))
+        assert 1 <= found.n_looks <= most
+        assert "misses them below 16; fly lower, or raise tile_limit_ms" in found.trouble
