@@ -21,6 +21,8 @@ PROVIDERS = {
     "tensorrt": "TensorrtExecutionProvider",
     "openvino": "OpenVINOExecutionProvider",
 }
+# OpenVINO on a processor takes its own number, not the session's; without it, eight threads or all.
+OPTIONS = {PROVIDERS["openvino"]: {"num_of_threads": "1"}}
 INPUT_TYPES: dict[str, type[np.floating[Any]]] = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
 TASKS = ("detect", "obb")
 WARM_UPS = 2  # one that allocates and, on an accelerator, compiles; one like all later ones
@@ -187,7 +189,8 @@ def open_session(path: Path, provider: str = PROVIDERS["cpu"]) -> onnxruntime.In
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     options.add_session_config_entry("session.inter_op.allow_spinning", "0")
     options.log_severity_level = 4  # errors come as exceptions; the library would print them as well
-    providers = [provider] if provider == PROVIDERS["cpu"] else [provider, PROVIDERS["cpu"]]
+    wanted = (provider, OPTIONS.get(provider, {}))
+    providers = [wanted] if provider == PROVIDERS["cpu"] else [wanted, PROVIDERS["cpu"]]
     try:
         return onnxruntime.InferenceSession(str(path), options, providers=providers)
     except Exception as error:  # see Network.run

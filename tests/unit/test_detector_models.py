@@ -9,6 +9,7 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 from procs.detector.decode import Layout, layout_of
+from procs.detector.network import PROVIDERS, open_session
 from procs.detector.yolo import Detector, ModelError
 from tests.unit.detector_networks import NAMES, PICTURE, network, raw, save
 
@@ -367,6 +368,20 @@ def test_a_provider_that_does_not_start_is_told_too(tmp_path: Path, monkeypatch:
         detector = Detector(network(tmp_path / "raw.onnx", raw((20, 30, 10, 20, 0.9))), provider="cuda")
     assert "CUDAExecutionProvider does not start on this machine" in detector.warning
     assert len(detector.detect(PICTURE)) == 1
+
+
+def test_openvino_gets_one_thread_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It does not look at the session's number; here it is not installed, so only what it is given shows."""
+    asked: list[list[tuple[str, dict[str, str]]]] = []
+
+    def session(*_: object, providers: list[tuple[str, dict[str, str]]]) -> None:
+        asked.append(providers)
+        raise RuntimeError("not here")
+
+    monkeypatch.setattr("onnxruntime.InferenceSession", session)
+    with pytest.raises(ModelError, match="not here"):
+        open_session(network(tmp_path / "raw.onnx", raw((20, 30, 10, 20, 0.9))), PROVIDERS["openvino"])
+    assert asked[0][0] == ("OpenVINOExecutionProvider", {"num_of_threads": "1"})
 
 
 def test_a_model_sees_red_first(tmp_path: Path) -> None:
