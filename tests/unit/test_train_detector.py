@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import onnx
 import pytest
 import torch
 from hypothesis import given, settings
@@ -147,6 +148,25 @@ def test_weights_are_taken_up_from_an_export_and_from_a_checkpoint(trained: Path
     (tmp_path / "foreign.onnx").write_bytes(b"nothing")
     with pytest.raises(ValueError, match=r"foreign\.onnx"):
         load_weights(WhaleDetector(), tmp_path / "foreign.onnx")
+
+
+def test_a_training_begins_from_the_weights_that_are_given_at_their_own_rate(
+    trained: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "detector_scenes").symlink_to(trained.parents[1] / "detector_scenes")
+    model = train(tmp_path / "run", TINY, begin_from=trained, stop_after=0)
+    expected = averaged(trained.parent).state_dict()
+    for name, value in averaged(model.parent).state_dict().items():
+        if value.ndim:
+            torch.testing.assert_close(value, expected[name], msg=name)
+    state = torch.load(model.parent / "checkpoint.pt", weights_only=True)
+    assert (state["step"], state["highest_rate"]) == (0, TINY.rate_from)
+
+
+def test_an_export_says_what_ultralytics_exports_say(trained: Path) -> None:
+    told = {entry.key: entry.value for entry in onnx.load(str(trained)).metadata_props}
+    assert told["imgsz"] == "[64, 64]"
+    assert (told["names"], told["stride"], told["task"]) == ("{0: 'whale'}", "32", "detect")
 
 
 def test_half_the_width_is_a_network_of_its_own(tmp_path: Path) -> None:

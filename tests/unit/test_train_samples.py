@@ -1,6 +1,7 @@
 """Samples keep boxes on their animals, whatever is done to the picture; what is read from disk is checked."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -14,7 +15,7 @@ from tools.render import Scene
 from tools.train.detector import samples
 from tools.train.detector.labels import read_labels
 from tools.train.detector.own import own_pictures
-from tools.train.detector.photographs import _window, empty_seas, photograph_sample
+from tools.train.detector.photographs import _pasted, _picked, _window, empty_seas, photograph_sample
 from tools.train.detector.pictures import photographs
 from tools.train.detector.samples import (
     SCENES_VERSION,
@@ -130,6 +131,24 @@ def test_samples_keep_boxes_on_their_animals(seed: int, rendered: bool) -> None:
         x0, y0, x1, y1 = int(left + 2), int(top + 2), int(right - 1), int(bottom - 1)
         if x1 - x0 >= 2 and y1 - y0 >= 2:
             assert np.median(sample.image[y0:y1, x0:x1]) > 1.25 * LIGHTEST_WATER
+
+
+def test_any_of_several_animals_is_pasted_and_its_neighbours_keep_their_boxes() -> None:
+    photo = Sample(np.full((160, 240, 3), 20, np.uint8), np.zeros((0, 5), np.float32))
+    corners = [(30, 60), (90, 60), (90, 84)]  # the last two nearly touch
+    for x, y in corners:
+        photo.image[y : y + 22, x : x + 50] = 255
+    photo = replace(photo, boxes=np.array([[x, y, x + 50, y + 22, 1] for x, y in corners], np.float32))
+    for seed in range(60):
+        pasted = _pasted([photo], [], np.random.default_rng(seed), 160)
+        unlabelled = pasted.image.max(axis=2) > 60
+        for left, top, right, bottom in pasted.boxes[:, :4].astype(int):
+            unlabelled[max(top - 2, 0) : bottom + 3, max(left - 2, 0) : right + 3] = False
+        assert not unlabelled.any(), seed
+    halved = replace(photo, half=replace(photo, boxes=photo.boxes / 2))
+    picked = [_picked([halved], np.random.default_rng(seed)) for seed in range(20)]
+    assert {tuple(each.boxes[0, :2]) for each in picked} == set(corners)
+    assert all(each.half is not None and (each.half.boxes == each.boxes / 2).all() for each in picked)
 
 
 def test_an_enlarged_photograph_fills_its_window_to_the_rim() -> None:

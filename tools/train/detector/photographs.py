@@ -1,6 +1,7 @@
 """Training pictures made of photographs: one of them, many side by side, or animals cut out and pasted."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import pairwise
 
 import cv2
@@ -41,6 +42,17 @@ def _window(
     # An enlarged picture ends half a pixel short of the rim.
     boxes = place(photo, canvas, scale, (float(shift[0]), float(shift[1])), cv2.BORDER_REPLICATE)
     return Sample(canvas, boxes)
+
+
+def _picked(photos: Sequence[Sample], rng: np.random.Generator) -> Sample:
+    """One of them, with any of its animals as the first one: the one that windows and cut-outs go by."""
+    photo = photos[int(rng.integers(len(photos)))]
+    return _with_first(photo, int(rng.integers(len(photo.boxes)))) if len(photo.boxes) > 1 else photo
+
+
+def _with_first(photo: Sample, index: int) -> Sample:
+    half = _with_first(photo.half, index) if photo.half is not None else None
+    return replace(photo, boxes=np.roll(photo.boxes, -index, axis=0), half=half)
 
 
 def empty_seas(photos: Sequence[Sample], least_px: int = 260) -> list[Image]:
@@ -87,7 +99,7 @@ def _mosaic(photos: Sequence[Sample], rng: np.random.Generator, side: int) -> Sa
     )
     for left, right in pairwise(columns):
         for top, bottom in pairwise(rows):
-            photo = photos[int(rng.integers(len(photos)))]
+            photo = _picked(photos, rng)
             animal_px = (
                 None
                 if rng.random() < 0.2
@@ -107,11 +119,11 @@ def _pasted(photos: Sequence[Sample], seas: Sequence[Sample], rng: np.random.Gen
         ).image
         boxes = np.zeros((0, 5), np.float32)
     else:
-        sea = _window(photos[int(rng.integers(len(photos)))], rng, (side, side), None)
+        sea = _window(_picked(photos, rng), rng, (side, side), None)
         canvas, boxes = sea.image, sea.boxes
     typical_px = min(_length_px(rng, side), 0.6 * side)
     for _ in range(int(rng.integers(1, 10))):
-        photo = photos[int(rng.integers(len(photos)))]
+        photo = _picked(photos, rng)
         if not len(photo.boxes):
             continue
         length_px = typical_px * float(rng.uniform(0.7, 1.2))
@@ -126,14 +138,16 @@ def _pasted(photos: Sequence[Sample], seas: Sequence[Sample], rng: np.random.Gen
         if size[0] >= side or size[1] >= side:
             continue
         u, v = int(rng.integers(0, side - size[0])), int(rng.integers(0, side - size[1]))
-        box = (photo.boxes[0, :4] - row([left, top, left, top])) * np.float32(scale) + row([u, v, u, v])
-        if any(_overlap(box, other) > 0.02 for other in boxes[:, :4]):
+        cut = (photo.boxes - row([left, top, left, top, 0])) * row([scale] * 4 + [1]) + row([u, v, u, v, 0])
+        # Neighbours that the cut-out shows come with it.
+        cut = np.concatenate([cut[:1], clipped(cut[1:], (u, v, u + size[0], v + size[1]))])
+        if any(_overlap(box, other) > 0.02 for box in cut[:, :4] for other in boxes[:, :4]):
             continue
         piece = cv2.resize(photo.image[top:bottom, left:right], size, interpolation=cv2.INTER_AREA).astype(
             np.float32
         )
         _feather(canvas[v : v + size[1], u : u + size[0]], piece, rng)
-        boxes = np.concatenate([boxes, np.append(box, 1.0)[None].astype(np.float32)])
+        boxes = np.concatenate([boxes, cut])
     return Sample(canvas, boxes)
 
 
@@ -178,7 +192,7 @@ def photograph_sample(
     kind = rng.random()
     if kind < 0.4:
         animal_px = None if rng.random() < 0.12 else _length_px(rng, side)
-        return _window(photos[int(rng.integers(len(photos)))], rng, (side, side), animal_px)
+        return _window(_picked(photos, rng), rng, (side, side), animal_px)
     if kind < 0.65:
         return _mosaic(photos, rng, side)
     return _pasted(photos, seas, rng, side)
