@@ -13,7 +13,7 @@ from lcmtypes.podwatch import frame_t, heartbeat_t, vehicle_state_t
 from procs.detector.process import setup
 from procs.detector.yolo import Detections, Detector, ModelError
 from procs.runtime import RuntimeFailure
-from procs.settings import CameraSettings, DroneSettings, Mission
+from procs.settings import CameraSettings, DroneSettings, Mission, WatchSettings
 from tests.fleet.bad_inputs import Bench
 from tests.unit.detector_networks import blob_network, network, raw
 
@@ -71,6 +71,19 @@ def test_it_knows_from_height_and_lens_how_long_an_animal_is() -> None:
     assert detector.told[3] is None, "it stands on the ground"
     assert detector.told[4] == pytest.approx(103.9, abs=0.1), "a position that is not ok says nothing"
     assert detector.told[5] is None, "the height is too old"
+
+
+def test_another_species_has_another_length() -> None:
+    """4 m from 40 m, through a lens of 60 and one of 90 degrees: 415.7 and 240 px of focal length."""
+    detector = Recorder()
+    drone = bench(detector)
+    drone.run(1.0)
+    for number, vfov_deg in enumerate((60.0, 90.0)):
+        mission = Mission(watch=WatchSettings(animal_length_m=4.0), camera=CameraSettings(vfov_deg=vfov_deg))
+        drone.runtime.reload(DroneSettings(drone_id=1, mission=mission))
+        fly_at(drone, 40.0)
+        show(drone, number)
+    assert detector.told == pytest.approx([41.57, 24.0], abs=0.01)
 
 
 def test_a_camera_that_hangs_for_a_second_gets_no_answer() -> None:
