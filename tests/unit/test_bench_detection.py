@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from procs.detector.yolo import Detections
+from procs.detector.yolo import Detections, Detector
 from tools.bench import detection
-from tools.bench.detection import Measures, available, command
+from tools.bench.detection import available, command
 from tools.bench.detection_figures import cells
 from tools.bench.detection_measure import Animal, Tally, held_out_photographs, look, open_detector, rendered
 from tools.bench.table import Row
@@ -89,28 +89,37 @@ def test_the_table_has_every_row_in_order_and_says_what_is_missing(
     assert (tmp_path / "detection_counts.png").is_file()
 
 
+# Of each model that ships, some hundredths under what it reached on these scenes when committed: recall,
+# precision, average precision on 40 validation scenes; false alarms a picture on 30 empty ones.
+FLOORS = {
+    "ours": (0.73, 0.77, 0.75, 0.33),
+    "int8": (0.72, 0.77, 0.75, 0.33),
+    "half width": (0.52, 0.73, 0.52, 0.43),
+}
+
+
 @pytest.fixture(scope="module")
-def ours() -> Tally:
-    """The model that ships on 40 validation scenes."""
-    detectors = Measures(1, paths=available()).ours
-    return look(detectors, rendered(40, 77, "val"))["ours"]
+def ships() -> dict[str, Detector]:
+    return {name: open_detector(path) for name, path in available().items()}
 
 
-def test_the_model_that_ships_finds_animals_of_species_that_it_never_learnt(ours: Tally) -> None:
-    found, false, missed = ours.counts()
-    assert found / (found + missed) > 0.5
-    assert found / (found + false) > 0.5
-    assert ours.average_precision() > 0.5
+def test_the_models_that_ship_find_animals_of_species_never_learnt(
+    ships: dict[str, Detector],
+) -> None:
+    for name, made in look(ships, rendered(40, 77, "val")).items():
+        found, false, missed = made.counts()
+        figures = (found / (found + missed), found / (found + false), made.average_precision())
+        assert np.all(np.greater(figures, FLOORS[name][:3])), (name, figures)
 
 
-def test_the_model_that_ships_is_quiet_over_empty_seas() -> None:
-    detectors = Measures(1, paths=available()).ours
-    _, false, _ = look(detectors, rendered(30, 77, "empty"))["ours"].counts()
-    assert false / 30 <= 0.7
+def test_the_models_that_ship_see_few_whales_over_empty_seas(ships: dict[str, Detector]) -> None:
+    for name, made in look(ships, rendered(30, 77, "empty")).items():
+        _, false, _ = made.counts()
+        assert false / 30 <= FLOORS[name][3], name
 
 
 @pytest.mark.skipif(not (real_data() / "right_whales").is_dir(), reason="needs ../shared/data")
 def test_the_model_that_ships_finds_real_whales_that_were_held_out() -> None:
     made = held_out_photographs({"ours": open_detector(available()["ours"])})["ours"]
     assert made.pictures == 20
-    assert made.average_precision() >= 0.9
+    assert made.average_precision() >= 0.95
