@@ -106,7 +106,13 @@ def there_and_back(pilot: Pilot, *, ready_s: float) -> list[float]:
     home_n, home_e, home_d = pilot.state["n_m"], pilot.state["e_m"], pilot.state["d_m"]
     pilot.fly_until(lambda: pilot.state["d_m"] < -14, ready_s + 60, kind=setpoint_t.TAKEOFF, d_m=-15.0)
     goal = {"n_m": home_n + 20.0, "e_m": home_e, "d_m": -15.0}
-    pilot.fly_until(lambda: abs(pilot.state["n_m"] - goal["n_m"]) < 1.0, 60, kind=setpoint_t.GOTO, **goal)
+    # At rest there: who lands on the move comes down some metres further on.
+    pilot.fly_until(
+        lambda: abs(pilot.state["n_m"] - goal["n_m"]) < 1.0 and abs(pilot.state["vn_m_s"]) < 0.3,
+        90,
+        kind=setpoint_t.GOTO,
+        **goal,
+    )
     aloft = moved()
     pilot.fly_until(lambda: pilot.state["landed"] and not pilot.state["armed"], 120, kind=setpoint_t.LAND)
     return aloft + moved()
