@@ -70,7 +70,14 @@ def load_weights(network: WhaleDetector, path: Path) -> None:
             }
         else:
             state = torch.load(path, weights_only=True, map_location="cpu")["average"]
-        counters = {name: value for name, value in network.state_dict().items() if value.ndim == 0}
+        fresh = network.state_dict()
+        if "heads.3.1.bias" not in state:  # of before the grid of 4 px: its grids are our coarser three
+            state = {
+                re.sub(r"^heads\.(\d)", lambda m: f"heads.{int(m[1]) + 1}", name): value
+                for name, value in state.items()
+            }
+            state = {n: fresh[n] for n in fresh if n.startswith(("heads.0.", "side4.", "narrow."))} | state
+        counters = {name: value for name, value in fresh.items() if value.ndim == 0}
         network.load_state_dict({**counters, **state})
     except Exception as error:  # onnx, pickle, torch: each has errors of its own
         raise UnusableError(
