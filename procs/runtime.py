@@ -157,7 +157,7 @@ class Runtime(ABC):
     def aside(self, work: Callable[[], Any], then: Callable[["Future[Any]"], None]) -> None:
         """Do `work()` beside the handlers, which go on, and hand what came of it to the handler `then`.
 
-        For what takes longer than a watchdog waits. `work` touches nothing that a handler changes.
+        For what takes longer than a watchdog waits. `work` changes nothing that a handler uses.
         """
 
     def publish(self, channel: str, message: Any) -> None:

@@ -281,9 +281,10 @@ def test_where_there_are_several_classes_somebody_must_say_which_are_whales(tmp_
         ("train: nowhere\nnames: [whale]\n", r"no pictures \(.jpg.*nowhere"),
         ("train: bare/images\nnames: [whale]\n", "none of its 1 pictures has a label file in .*bare/labels"),
         ("train: bare/images\n", "no entry 'names'"),
-        ("train: bare/images\nnames: [whale\n", "has no end"),
+        ("train: bare/images\nnames: [whale\n", "is no YAML at line 3: expected"),
+        ("just words\n", "no mapping of keys to values"),
         ("train: bare/images\nnc: some\n", "nc is 'some'"),
-        ("\x89PNG", "not 'key: value'"),
+        ("\x89PNG", "is no YAML: .*not allowed"),
     ],
 )
 def test_a_data_file_of_no_use_is_refused_with_the_remedy(tmp_path: Path, text: str, message: str) -> None:

@@ -23,6 +23,7 @@ from drivers.sim.render.effects import (
     noisy,
     vignetted,
 )
+from tools.errors import UnusableError
 from tools.render.pods import POSTER_LENGTHS_M, SPLITS, Pod, Split, make_pod, make_view, pick_species
 from tools.render.visible import LEAST_CONTRAST, LEAST_SHARE, Visible, draw_and_see
 
@@ -108,10 +109,10 @@ def scenes(
     noise and compression too (the trainer adds its own, different at every look). seas: photographs of empty
     water that take the place of the rendered one. views: of each scene, one after another: the same animals
     under the same ids, at the same instant, each from a place and with an air and a camera of its own. Raises
-    ValueError for an unknown split.
+    UnusableError for an unknown split.
     """
     if split not in SPLITS:
-        raise ValueError(f"split {split!r} is not known; there are: {', '.join(SPLITS)}")
+        raise UnusableError(f"split {split!r} is not known; there are: {', '.join(SPLITS)}")
     drawn, place = SPLITS[split], None
     for index in range(count):
         rng = np.random.default_rng([drawn.seed + seed, index])
@@ -119,15 +120,16 @@ def scenes(
             place = _place(rng, drawn, drawn.seed + seed * 10_000 + index, shapes, seas)
         for _ in range(TRIES):
             shot = _shot(rng, place, drawn, side, animals, camera_effects)
-            scene = None if shot is None else _taken(rng, place, drawn, shot, animals)
-            if shot is not None and scene is not None:
+            if shot is None:
+                continue
+            scene = _drawn(rng, place, drawn, shot)
+            if animals is None or (len(scene.ids) == animals and not len(scene.faint)):
                 yield scene
                 for _ in range(views - 1):
-                    another = _from_elsewhere(rng, place, shot, camera_effects)
-                    yield _drawn(rng, place, drawn, another)
+                    yield _drawn(rng, place, drawn, _from_elsewhere(rng, place, shot, camera_effects))
                 break
         else:
-            raise ValueError(f"{animals} animals do not fit into a picture of {side}; ask for fewer")
+            raise UnusableError(f"{animals} animals do not fit into a picture of {side}; ask for fewer")
 
 
 def _place(
@@ -236,15 +238,6 @@ def _from_elsewhere(rng: np.random.Generator, place: _Place, shot: _Shot, camera
     roll, pitch = np.clip(rng.normal(0, 0.1, 2), -0.35, 0.35).tolist()
     pose = Pose(north_m, east_m, -height_m, roll, pitch, float(rng.uniform(-np.pi, np.pi)))
     return replace(shot, pose=pose, conditions=_conditions(rng, place, camera_effects))
-
-
-def _taken(
-    rng: np.random.Generator, place: _Place, split: Split, shot: _Shot, wanted: int | None
-) -> Scene | None:
-    """None where the picture shows another number of animals than was wanted."""
-    scene = _drawn(rng, place, split, shot)
-    exact = len(scene.ids) == wanted and not len(scene.faint)
-    return scene if wanted is None or exact else None
 
 
 def _drawn(rng: np.random.Generator, place: _Place, split: Split, shot: _Shot) -> Scene:

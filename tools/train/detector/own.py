@@ -1,9 +1,11 @@
 """Your own pictures: a YOLO data set in any of the shapes in which people have them."""
 
 import os
-import re
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
+
+import yaml
 
 from tools.errors import UnusableError
 from tools.train.detector.labels import text_of
@@ -12,8 +14,6 @@ from tools.train.detector.samples import Sample, read_yolo
 __all__ = ["own_pictures"]
 
 PICTURES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff")
-# What commas divide: quoted text, lists and mappings are whole.
-PART = re.compile(r"""(?:[^,\[\]{}'"]|'[^']*'|"[^"]*"|\[[^\]]*\]|\{[^}]*\})+""")
 
 
 def own_pictures(data_yaml: Path, classes: Sequence[str] = (), part: str = "train") -> list[Sample]:
@@ -26,14 +26,14 @@ def own_pictures(data_yaml: Path, classes: Sequence[str] = (), part: str = "trai
     if not data_yaml.is_file():
         raise UnusableError(f"{data_yaml}: no such file; give the data.yaml of a YOLO data set")
     try:
-        entries = _entries(text_of(data_yaml), ("path", "nc", "names", part))
+        entries = _read(data_yaml)
         counted = _counted(entries, classes)
         if not entries.get(part):
             raise ValueError(f"has no entry {part!r}; it must name the folder of its pictures")
     except ValueError as error:
         raise UnusableError(f"{data_yaml}: {error}") from None
-    root = data_yaml.parent / entries.get("path", {}).get("0", ".")
-    named = list(entries[part].values())
+    root = data_yaml.parent / str(entries.get("path") or ".")
+    named = [str(name) for name in (entries[part] if isinstance(entries[part], list) else [entries[part]])]
     found = list(dict.fromkeys(path for name in named for path in _listed(_place(root, name), root)))
     if not found:
         raise UnusableError(f"{data_yaml}: no pictures ({', '.join(PICTURES)}) in {_place(root, named[0])}")
@@ -49,17 +49,35 @@ def own_pictures(data_yaml: Path, classes: Sequence[str] = (), part: str = "trai
     return samples
 
 
-def _counted(entries: dict[str, dict[str, str]], classes: Sequence[str]) -> dict[int, bool]:
+def _read(data_yaml: Path) -> dict[str, Any]:
+    """The entries of a data.yaml. Raises ValueError where it is no YAML, or no mapping."""
+    try:
+        entries = yaml.safe_load(text_of(data_yaml))
+    except yaml.MarkedYAMLError as error:
+        line = error.problem_mark.line + 1 if error.problem_mark else 1
+        raise ValueError(f"is no YAML at line {line}: {error.problem}") from None
+    except yaml.YAMLError as error:  # such as control characters
+        raise ValueError(f"is no YAML: {' '.join(str(error).split())}") from None
+    if not isinstance(entries, dict):
+        raise ValueError("is no mapping of keys to values, such as 'train: images/train'")
+    return entries
+
+
+def _counted(entries: dict[str, Any], classes: Sequence[str]) -> dict[int, bool]:
     """Of each class number whether it counts. Raises ValueError where that is not known."""
-    many = entries.get("nc", {}).get("0", "0")
-    if not many.isdecimal():
+    many = entries.get("nc", 0)
+    if not isinstance(many, int):
         raise ValueError(f"nc is {many!r}, which is no number of classes")
-    names = entries.get("names") or {str(number): str(number) for number in range(int(many))}
-    if not names or not all(number.isdecimal() for number in names):
+    given = entries.get("names") or [str(number) for number in range(many)]
+    names = (
+        given if isinstance(given, dict) else dict(enumerate(given if isinstance(given, list) else [given]))
+    )
+    if not names or not all(isinstance(number, int) for number in names):
         raise ValueError("has no entry 'names' that gives each class number a name: names: [whale]")
     told = ", ".join(f"{number} {name}" for number, name in names.items())
+    known = {str(word) for pair in names.items() for word in pair}
     for asked in classes:
-        if asked not in names and asked not in names.values():
+        if asked not in known:
             raise ValueError(f"has no class {asked!r}; there are: {told}")
     if not classes and len(names) > 1:
         raise ValueError(
@@ -67,62 +85,9 @@ def _counted(entries: dict[str, dict[str, str]], classes: Sequence[str]) -> dict
             f"--classes {next(iter(names.values()))} (there are: {told})"
         )
     return {
-        int(number): not classes or name in classes or number in classes for number, name in names.items()
+        number: not classes or str(name) in classes or str(number) in classes
+        for number, name in names.items()
     }
-
-
-def _entries(text: str, wanted: Sequence[str]) -> dict[str, dict[str, str]]:
-    """What stands under the wanted keys of a data.yaml: the items of a mapping, or of a list by "0",
-    "1", ...; one text alone is item "0". Raises ValueError for a line that is none of these.
-    """
-    lines = [re.sub(r"(^|\s)#.*", "", line).rstrip() for line in text.splitlines()]
-    lines = [line for line in lines if line and line not in ("---", "...")]
-    whole = " ".join(lines).strip()
-    if whole.startswith("{"):
-        return {key: _items(value) for key, value in map(_pair, _parts(whole)) if key in wanted}
-    blocks: dict[str, list[str]] = {}
-    for line in lines:
-        if not blocks or (line[0] not in " \t-" and ":" in line):
-            key, value = _pair(line)
-            blocks[key] = [value] if value else []
-        else:
-            blocks[key].append(line.strip())
-    return {key: _block(block) for key, block in blocks.items() if key in wanted}
-
-
-def _block(lines: list[str]) -> dict[str, str]:
-    if all(line.startswith("- ") for line in lines):
-        return {str(index): _plain(line[2:]) for index, line in enumerate(lines)}
-    return (
-        dict(map(_pair, lines))
-        if ": " in lines[0] and lines[0][0] not in "[{'\""
-        else _items(" ".join(lines))
-    )
-
-
-def _items(value: str) -> dict[str, str]:
-    """Of a value in one line: [a, b], {0: a, 1: b}, or a text."""
-    if value.startswith("{"):
-        return dict(map(_pair, _parts(value)))
-    parts = _parts(value) if value.startswith("[") else [value]
-    return {str(index): _plain(part) for index, part in enumerate(parts) if part}
-
-
-def _parts(value: str) -> list[str]:
-    if value[-1] != {"[": "]", "{": "}"}[value[0]]:
-        raise ValueError(f"{value!r} has no end")
-    return [part.strip() for part in PART.findall(value[1:-1]) if part.strip()]
-
-
-def _pair(line: str) -> tuple[str, str]:
-    key, colon, value = line.partition(":")
-    if not colon:
-        raise ValueError(f"{line.strip()!r} is not 'key: value'")
-    return _plain(key), value.strip() if value.strip()[:1] in ("[", "{") else _plain(value)
-
-
-def _plain(text: str) -> str:
-    return text.strip().strip("'\"")
 
 
 def _place(root: Path, name: str) -> Path:

@@ -18,6 +18,7 @@ from tools.train.detector.samples import (
     WITH_EXTRAS,
     Sample,
     augment,
+    cache_files,
     cached_scenes,
     held_out,
     letterboxed,
@@ -58,7 +59,7 @@ class Batches(torch.utils.data.Dataset[tuple[torch.Tensor, list[torch.Tensor]]])
     ) -> None:
         self.mixture, self.own, self.steps = mixture, own, steps
         self.photographs = photographs()
-        self.rendered = _rendered(cache, mixture, has_seas=bool(_seas(self.photographs)))
+        self.rendered = _rendered(cache, mixture, _seas(self.photographs))
         self.empty = [sample for sample in self.rendered if len(sample.boxes) == 0]
 
     def __len__(self) -> int:
@@ -90,31 +91,35 @@ class Batches(torch.utils.data.Dataset[tuple[torch.Tensor, list[torch.Tensor]]])
         return scene_sample(pool[int(rng.integers(len(pool)))], rng, m.side)
 
 
-def _rendered(cache: Path, mixture: Mixture, has_seas: bool) -> list[Sample]:
+def _rendered(cache: Path, mixture: Mixture, seas: Sequence[Image]) -> list[Sample]:
     """All rendered scenes; those that are not in the cache are made on all processors."""
     chunks = [
         (min(SCENES_A_FILE, count - start), mixture.scenes_seed + start // SCENES_A_FILE, on_photographs)
-        for count, on_photographs in (
-            (mixture.scenes, False),
-            (mixture.scenes_on_photographs * has_seas, True),
-        )
-        for start in range(0, count, SCENES_A_FILE)
+        for count, on_photographs in ((mixture.scenes, False), (mixture.scenes_on_photographs, True))
+        for start in range(0, count if seas or not on_photographs else 0, SCENES_A_FILE)
     ]
-    if len(chunks) > 1:
+    missing = [
+        chunk for chunk in chunks if not cache_files(cache, *chunk[:2], "train", chunk[2])[1].is_file()
+    ]
+    if len(missing) > 1:
         # New processes, not copies of this one: it may have threads, which do not survive copying.
         with ProcessPoolExecutor(os.cpu_count(), mp_context=get_context("spawn")) as pool:
-            list(pool.map(_make_chunk, [cache] * len(chunks), chunks))
-    return [sample for chunk in chunks for sample in _chunk(cache, *chunk)]
+            list(pool.map(_make_chunk, [cache] * len(missing), missing))
+    return [
+        sample
+        for count, seed, on_photographs in chunks
+        for sample in _chunk(cache, count, seed, seas if on_photographs else [])
+    ]
 
 
 def _make_chunk(cache: Path, chunk: tuple[int, int, bool]) -> None:
     cv2.setNumThreads(1)
-    _chunk(cache, *chunk)
+    count, seed, on_photographs = chunk
+    _chunk(cache, count, seed, _seas(photographs()) if on_photographs else [])
 
 
-def _chunk(cache: Path, count: int, seed: int, on_photographs: bool) -> list[Sample]:
+def _chunk(cache: Path, count: int, seed: int, seas: Sequence[Image]) -> list[Sample]:
     outlines = real_data() / "whale_outlines" / "outlines.csv"
-    seas = _seas(photographs()) if on_photographs else []
     return cached_scenes(cache, count, seed, "train", outlines, seas)
 
 

@@ -32,6 +32,7 @@ __all__ = [
     "WITH_EXTRAS",
     "Sample",
     "augment",
+    "cache_files",
     "cached_scenes",
     "clipped",
     "held_out",
@@ -87,6 +88,12 @@ def held_out(images: Sequence[Path]) -> tuple[list[Path], list[Path]]:
     return [path for i, path in enumerate(ordered) if i % 5], ordered[::5]
 
 
+def cache_files(folder: Path, count: int, seed: int, split: str, on_photographs: bool) -> tuple[Path, Path]:
+    """Where `cached_scenes` keeps pictures and boxes; the boxes are written last."""
+    name = f"{split}{'_on_photographs' if on_photographs else ''}_{seed}_{count}_v{SCENES_VERSION}"
+    return folder / f"{name}.images.npy", folder / f"{name}.boxes.npz"
+
+
 def cached_scenes(
     folder: Path, count: int, seed: int, split: str, outlines_csv: Path, seas: Sequence[Image] = ()
 ) -> list[Sample]:
@@ -94,8 +101,7 @@ def cached_scenes(
 
     seas: photographs of water that take the place of the rendered one.
     """
-    name = f"{split}{'_on_photographs' if seas else ''}_{seed}_{count}_v{SCENES_VERSION}"
-    images_path, boxes_path = folder / f"{name}.images.npy", folder / f"{name}.boxes.npz"
+    images_path, boxes_path = cache_files(folder, count, seed, split, bool(seas))
     if not boxes_path.is_file():  # written last: a killed run leaves none and begins again
         folder.mkdir(parents=True, exist_ok=True)
         shape = (count, CACHE_SIDE, CACHE_SIDE, 3)

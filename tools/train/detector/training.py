@@ -37,7 +37,7 @@ class Settings:
     """What shapes a training, each with its reason."""
 
     pictures: Mixture = field(default_factory=Mixture)
-    steps: int = 20000  # an hour and a half on two idle cores; more steps still help
+    steps: int = 20000  # two hours on one idle core; more steps still help
     minutes: float | None = None  # of running time, in place of steps: the rate then follows the clock
     width: float = 1.0  # of the network: its channels times this
     rate: float = 2e-3  # the highest that never diverged with AdamW on this network
