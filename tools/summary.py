@@ -18,6 +18,7 @@ from rich.table import Table
 from rich.text import Text
 
 from lcmtypes import channels
+from procs.navigator.states import State
 from tools.called import Order, call_words, fleet_order, order_of
 from tools.evidence import DroneLog, Run, load_run
 from tools.judge import DroneVerdict, Verdict, judge
@@ -104,6 +105,8 @@ def _went(summary: Summary) -> tuple[bool | None, str]:
             f"{_count(len(watching), 'drone')} watched animals; nobody marked the animals of this scene, "
             "so who watched whom cannot be judged."
         )
+    if all(drone["final_state"] == State.IDLE.name for drone in summary["drones"]):
+        return False, "No drone took off."
     if summary["monitor_window_s"] is None:
         return False, "The fleet never came to watch its animals together."
     if not summary["distinct"]:

@@ -94,3 +94,5 @@ def test_logs_that_cannot_be_played_are_told(tmp_path):
     assert "never measured each other's clocks" in result.stderr
     assert CliRunner().invoke(app, ["play", str(tmp_path / "none.mcap")]).exit_code == 2
     assert CliRunner().invoke(app, ["play", str(logs[0]), "--speed", "0"]).exit_code == 2
+    result = CliRunner().invoke(app, ["play", str(logs[0]), "-c", "NOPE"])
+    assert (result.exit_code, channels.TRACK in result.stderr) == (2, True), result.stderr

@@ -102,6 +102,14 @@ def test_success_is_said_in_one_sentence(good: dict[str, Any]) -> None:
     assert "camera to command 60 ms" in text
 
 
+def test_a_fleet_that_stayed_on_the_ground_is_told_so(good: dict[str, Any]) -> None:
+    waited = [drone | {"final_state": "IDLE", "monitor_s": 0} for drone in good["drones"]]
+    summary = good | {"monitor_window_s": None, "distinct": False, "drones": waited}
+    assert headline(summary) == (False, "No drone took off.")
+    waited[1]["final_state"] = "LANDED"
+    assert headline(summary)[1].startswith("The fleet never came to watch")
+
+
 def test_failure_names_its_reasons_first(tmp_path: Path) -> None:
     run = FakeRun(watch=lambda drone, t_s: 1 if drone == 3 and t_s > 20 else drone, deaths={2: 25.0})
     summary = summarise(run.write(tmp_path / "run"))

@@ -10,6 +10,7 @@ from drivers.cameras.replay import decode_picture
 from drivers.frames import SharedFrames
 from lcmtypes import channels, make
 from lcmtypes.podwatch import frame_t, preview_t
+from logs.exceptions import LogError
 from logs.fleet import FleetMessage
 from logs.sequence import read_head
 from tools.playback.playhead import Playhead
@@ -31,11 +32,14 @@ class KeySource(Protocol):
 
 @dataclass
 class Played:
-    """What was played so far. late_s: of every message, how long after its time it was said."""
+    """What was played so far. late_s: of every message, how long after its time it was said. passed_by: the
+    channels of messages in the span that were not wanted.
+    """
 
     n_messages: int = 0
     n_frames: int = 0
     late_s: "array[float]" = field(default_factory=lambda: array("f"))
+    passed_by: set[str] = field(default_factory=set)
 
     def late_ms(self, share: float) -> float:
         """The lateness that `share` of the messages keep, ms."""
@@ -72,15 +76,22 @@ class Player:
         self._shown_s = 0.0
 
     def play(self, messages: Iterable[FleetMessage], keys: KeySource) -> bool:
-        """Play everything; False where a key ended it."""
+        """Play everything; False where a key ended it. Raises LogError where nothing of it was wanted."""
         for entry in self._selection.cut(messages):
             if self.begin_us is None:
                 self.begin_us = entry.at_us
             said = list(self._said(entry))
+            if not said:
+                self.played.passed_by.add(entry.raw.channel)
             if said and not self._await(entry.at_us, keys):
                 return False
             for channel, data in said:
                 self._buses[entry.drone_id].publish(channel, data)
+        if self.played.passed_by and not self.played.n_messages:
+            raise LogError(
+                "nothing to play: no message of this time is on a channel that was asked for (--channel, "
+                f"--without); there are {', '.join(sorted(self.played.passed_by))}"
+            )
         return True
 
     def again(self) -> None:
