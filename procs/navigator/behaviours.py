@@ -88,6 +88,7 @@ def standby(now: Situation, memory: Memory, camera: Pinhole) -> Step:
     assignment = now.inputs.assignment
     if memory.surplus and memory.find is not None:
         step = fly_to(now, surplus_place(now, memory.find, camera), now.mission.watch.speed_m_s)
+        step.on_station = True  # it takes part from here: who gathers again does not wait for it
         step.wants_episode = surplus.asks(now, memory)
         is_new = assignment is not None and episode_key(assignment) > memory.assigned_key
         if assignment is not None and is_new and assignment.certified and assignment.animal >= 0:

@@ -5,10 +5,11 @@ import pytest
 
 from lcmtypes import make, podwatch
 from procs.navigator import surplus
+from procs.navigator.behaviours import PATIENCE_S
 from procs.navigator.mission import Inputs, Navigator
 from procs.navigator.situation import Situation
 from procs.navigator.states import State
-from tests.unit.navigator_flights import Fleet, mission
+from tests.unit.navigator_flights import Drone, Fleet, mission
 from tests.unit.test_navigator_mission import DRIFT, POD, flown_to
 
 S = 1_000_000
@@ -38,6 +39,32 @@ def test_a_surplus_drone_takes_the_animal_of_one_that_was_lost() -> None:
     assert left.states[-1] == State.MONITOR, "who watches goes on"
     fleet.run(40.0)
     assert fleet.pixels(spare)[1][wanted]
+
+
+def test_nobody_who_gathers_again_waits_for_a_surplus_drone_to_come_into_the_circle(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    fleet = three_over_two()
+    watcher = next(drone for drone in fleet.drones if drone.navigator.state == State.MONITOR)
+    animal, track, identities = watcher.navigator.memory.animal, fleet._track, fleet._identities
+
+    def unseen(drone: Drone) -> podwatch.track_t | None:
+        said = track(drone)
+        if drone is watcher and said is not None:
+            said.state = podwatch.track_t.LOST
+        return said
+
+    def seen_before() -> podwatch.identities_t:
+        said = identities()
+        for entry in said.map:
+            entry.age_ms = 15_000 if entry.id == animal else 0
+        return said
+
+    monkeypatch.setattr(fleet, "_track", unseen)
+    monkeypatch.setattr(fleet, "_identities", seen_before)
+    fleet.run(60.0, lambda: watcher.navigator.state == State.RENDEZVOUS)
+    assert (watcher.navigator.state, fleet.episode) == (State.RENDEZVOUS, 1)
+    assert fleet.run(60.0, lambda: fleet.episode > 1) < PATIENCE_S
 
 
 def test_it_asks_only_so_often_for_what_the_ring_does_not_agree_on() -> None:
