@@ -5,6 +5,7 @@ from numpy.typing import NDArray
 
 from drivers.cameras.pinhole import Pinhole
 from lcmtypes import podwatch
+from procs.navigator import surplus
 from procs.navigator.behaviours import fly_to
 from procs.navigator.servo import ground_points, servo_velocity
 from procs.navigator.situation import Memory, Situation, Step, episode_key
@@ -103,6 +104,7 @@ def monitor(now: Situation, memory: Memory, camera: Pinhole) -> Step:
         memory.seen_us = now.utime
     unseen_s = now.seconds_since(memory.seen_us)
     step = _over_animal(now, memory, unseen_s)
+    step.wants_episode = surplus.asks_for_another(now, memory, is_unsure=unseen_s > UNSURE_S)
     if memory.animal in now.left:
         event = Event.LEAVE
     elif unseen_s > GIVE_UP_S or (unseen_s > UNSURE_S and _only_strangers(now, memory)):

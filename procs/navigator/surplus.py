@@ -1,14 +1,14 @@
 """A surplus drone in place of one that was lost: it asks for an episode when an animal has nobody, or when it
-sees one that the map does not know.
+sees one that the map does not know. Who watches asks too when it sees such a one and somebody has none.
 
 It takes an animal by the certificate of an episode and in no other way, so that two that wait never take the
 same, and nobody takes one that another still watches. Those that watch go on; the episode runs beside that.
 """
 
 from procs.navigator.situation import Memory, Situation, episode_key
-from procs.navigator.states import GATHERED
+from procs.navigator.states import GATHERED, State
 
-__all__ = ["FREE_FOR_S", "MOST_ASKED", "asks"]
+__all__ = ["FREE_FOR_S", "MOST_ASKED", "asks", "asks_for_another"]
 
 FREE_FOR_S = 5.0  # beside the 3 s after which a drone counts as lost: it may only have been silent
 SEEN_WITHIN_S = 10.0  # an animal that nobody saw for longer may have dived
@@ -39,8 +39,7 @@ def asks(now: Situation, memory: Memory) -> bool:
     elif key > memory.free_key:
         memory.n_asked += 1  # an episode has ended, and they still have nobody
     memory.free_animals, memory.free_key = tuple(sorted({*known, *free})), key
-    gathering = any(row.state in GATHERED for row in now.others)
-    if gathering or identities.episode_running:
+    if _comes_anyway(now):
         memory.free_since_us = memory.stranger_since_us = 0
         return False
     if _sees_stranger(now, memory):
@@ -50,6 +49,24 @@ def asks(now: Situation, memory: Memory) -> bool:
         return False
     memory.free_since_us = memory.free_since_us or now.utime
     return now.seconds_since(memory.free_since_us) > FREE_FOR_S and memory.n_asked < MOST_ASKED
+
+
+def asks_for_another(now: Situation, memory: Memory, is_unsure: bool) -> bool:
+    """Whether a drone that watches asks for an episode now: for STRANGER_FOR_S there has been an animal in
+    view without a name, and somebody has none: one that stands by, or, where `is_unsure`, this one, whose own
+    it has not seen for a while.
+    """
+    if _comes_anyway(now) or not (is_unsure or any(row.state == State.STANDBY for row in now.others)):
+        memory.stranger_since_us = 0
+        return False
+    return _sees_stranger(now, memory)
+
+
+def _comes_anyway(now: Situation) -> bool:
+    """Whether an episode runs, or somebody gathers for one."""
+    identities = now.inputs.identities
+    gathers = any(row.state in GATHERED for row in now.others)
+    return gathers or (identities is not None and identities.episode_running)
 
 
 def _sees_stranger(now: Situation, memory: Memory) -> bool:

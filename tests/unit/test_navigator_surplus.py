@@ -1,5 +1,9 @@
 """A surplus drone takes over from one that was lost; the watch's clock counts what was watched."""
 
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -95,9 +99,11 @@ def asked_s(entries: list, rows: list, seconds: float = 20.0, running: bool = Fa
     return None
 
 
-def stranger_asked_s(ids: list[int], left_px: float, episodes: int = 1) -> list[float]:
-    """When a surplus drone asks, over a minute in which every ask is answered by an episode that changes
-    nothing, at most `episodes` of them.
+def stranger_asked_s(
+    ids: list[int], left_px: float, episodes: int = 1, rows: Sequence[Any] = (), asks: Any = surplus.asks
+) -> list[float]:
+    """When a surplus drone (or another that decides by `asks`) asks, over a minute in which every ask is
+    answered by an episode that changes nothing, at most `episodes` of them.
     """
     navigator = Navigator(mission(3), 1)
     box = make(podwatch.box_t, left_px=left_px, top_px=100.0, right_px=left_px + 80, bottom_px=140.0)
@@ -105,13 +111,13 @@ def stranger_asked_s(ids: list[int], left_px: float, episodes: int = 1) -> list[
     number = 1
     for k in range(600):
         utime = 100 * S + k * S // 10
-        fleet = make(podwatch.fleet_state_t, utime=utime)
+        fleet = make(podwatch.fleet_state_t, utime=utime, n_rows=len(rows), rows=rows)
         identities = make(
             podwatch.identities_t, utime=utime, episode=number, width=640, height=480, n_boxes=len(ids),
             boxes=[box] * len(ids), ids=ids,
         )  # fmt: skip
         inputs = Inputs(utime, identities=identities, fleet=fleet)
-        if surplus.asks(Situation(navigator.mission, 1, inputs, navigator.memory), navigator.memory):
+        if asks(Situation(navigator.mission, 1, inputs, navigator.memory), navigator.memory):
             asked.append(k / 10)
             number += number < episodes
     return asked
@@ -124,6 +130,25 @@ def test_an_animal_that_the_map_does_not_know_brings_an_episode_too() -> None:
     assert stranger_asked_s([3, -1], 1.0) == [], "cut by the picture's edge"
     assert stranger_asked_s([3, -1], 558.0) == []
     assert len(stranger_asked_s([-1], 200.0, episodes=99)) == surplus.MOST_ASKED
+
+
+@pytest.mark.parametrize(
+    ("others", "is_unsure", "asks"),
+    [
+        ([(2, 0, State.MONITOR), (3, -1, State.STANDBY)], False, True),
+        ([(2, 0, State.MONITOR), (3, -1, State.STANDBY, False)], False, False),  # it is lost
+        ([(2, 0, State.MONITOR)], False, False),  # everybody has one
+        ([(2, 0, State.MONITOR)], True, True),
+        ([(2, -1, State.RENDEZVOUS), (3, -1, State.STANDBY)], True, False),  # an episode comes anyway
+    ],
+)
+def test_who_watches_asks_when_it_sees_an_animal_for_one_that_has_none(others, is_unsure, asks) -> None:
+    rows = [row(*other) for other in others]
+    decides = partial(surplus.asks_for_another, is_unsure=is_unsure)
+    asked = stranger_asked_s([3, -1], 200.0, rows=rows, asks=decides)
+    assert bool(asked) is asks
+    assert asked[:1] == pytest.approx([surplus.STRANGER_FOR_S] * asks, abs=0.2)
+    assert stranger_asked_s([3, 4], 200.0, rows=rows, asks=decides) == []
 
 
 def animal(number: int, age_ms: int = 200) -> podwatch.map_animal_t:
