@@ -15,7 +15,7 @@ __all__ = ["keep_clock", "sense", "share"]
 Array = NDArray[np.float64]
 
 NEAR_M = 40.0  # a drone so near to the pod sees it; a farther one only repeats what it heard
-STRAY_M = 15.0  # boxes further than this outside the pod are not of the pod
+STRAY_LENGTHS = 3.0  # boxes further than this outside the pod, in body lengths, are not of the pod
 FRESH_MAP_S = 10.0
 INSET = 0.1  # share of the picture's sides near which an animal may be cut off
 PERIOD_S = 0.5  # at which the drift of the find is estimated
@@ -44,7 +44,8 @@ def sense(now: Situation, memory: Memory, camera: Pinhole) -> None:
     )
     if memory.find is not None:
         away = np.linalg.norm(points - memory.find.ne, axis=1)
-        points = points[away < memory.find.radius_m + STRAY_M]
+        stray_m = STRAY_LENGTHS * now.mission.watch.animal_length_m
+        points = points[away < memory.find.radius_m + stray_m]
     elif memory.gate.share < 0.1:
         memory.barycentre.reset()
     memory.barycentre.update(

@@ -2,13 +2,16 @@
 old, no clock.
 """
 
+from typing import Any
+
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from lcmtypes import make, podwatch
 from procs.navigator.mission import Navigator
 from procs.navigator.states import Event, State
-from tests.unit.navigator_flights import Drone, Fleet, mission
+from tests.unit.navigator_flights import Array, Drone, Fleet, mission
 
 POD = np.array([[92.0, -8.0], [104.0, 3.0], [96.0, 12.0], [110.0, -6.0], [101.0, -15.0]])
 DRIFT = np.array([0.5, 0.2])
@@ -103,6 +106,25 @@ def test_a_scout_that_restarts_goes_on_scouting_and_never_takes_off_in_flight() 
     assert fleet.drone(1).navigator.state == State.SCOUT
     assert fleet.drone(1).navigator.memory.waypoint >= 2
     assert fleet.drone(1).states.count(State.TAKEOFF) == 1
+
+
+def test_an_animal_that_comes_up_beside_the_find_is_gathered_over_too(monkeypatch: Any) -> None:
+    """Seed 25 of the default flight: the find was one animal, the other four came up 22 to 26 m from it, and
+    the fleet went down over the one.
+    """
+    away_m = 26.0
+    fleet = Fleet(mission(3), POD[0] + np.array([[0.0, 0.0], [away_m, 0.0]]))
+    pixels = fleet.pixels
+
+    def only_the_first_until_it_is_found(drone: Drone) -> tuple[Array, NDArray[np.bool_]]:
+        points, inside = pixels(drone)
+        inside[1] &= any(State.RENDEZVOUS in one.states for one in fleet.drones)
+        return points, inside
+
+    monkeypatch.setattr(fleet, "pixels", only_the_first_until_it_is_found)
+    fleet.run(120.0, lambda: fleet.episode > 0)
+    finds = [drone.navigator.memory.find for drone in fleet.drones]
+    assert all(find is not None and find.radius_m > away_m / 2 for find in finds), finds
 
 
 def test_a_pod_that_dives_for_20_s_is_waited_for() -> None:
