@@ -13,7 +13,7 @@ device is used where there is one.
 
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -23,120 +23,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tools.errors import UnusableError
-from tools.train.detector.export import check_export, export, load_weights, quantise
+from tools.train.detector.export import check_export, export, quantise
 from tools.train.detector.loss import detection_loss
-from tools.train.detector.model import Sizes, WhaleDetector, cell_centres, decode
+from tools.train.detector.model import cell_centres, decode
 from tools.train.detector.own import own_pictures
 from tools.train.detector.pictures import Batches, Mixture
+from tools.train.detector.run import Given, Run, Settings, averaged
 
 __all__ = ["Settings", "averaged", "command", "settings_of", "train"]
-
-
-@dataclass(frozen=True)
-class Settings:
-    """What shapes a training, each with its reason."""
-
-    pictures: Mixture = field(default_factory=Mixture)
-    steps: int = 20000  # two hours on one idle core; more steps still help
-    minutes: float | None = None  # of running time, in place of steps: the rate then follows the clock
-    width: float = 1.0  # of the network: its channels times this
-    rate: float = 2e-3  # the highest that never diverged with AdamW on this network
-    rate_from: float = 1e-3  # with weights that know something already
-    last_rate_share: float = 0.01  # a cosine down to this settles the boxes
-    warmup_steps: int = 300  # assignment is random before the boxes mean anything
-    weight_decay: float = 0.03  # the photographs are few
-    average_decay: float = 0.9985  # the exported weights are a running mean over about 700 steps
-    early_share: float = (
-        0.5  # of the training at smaller pictures first: half again as many steps for the time
-    )
-    early_side: int = 256
-    save_every_steps: int = 100  # a kill loses a minute
-    workers: int = 1  # processes that make pictures; 0: none, this one does
-    threads: int = 1  # of the network; on a busy machine two wait for each other
-
-
-class _Run:
-    """All that a checkpoint holds, and what it takes to make a step."""
-
-    def __init__(self, settings: Settings) -> None:
-        torch.manual_seed(settings.pictures.seed)
-        self.device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-        self.network = WhaleDetector(sizes=Sizes().scaled(settings.width)).to(
-            self.device, memory_format=torch.channels_last
-        )  # type: ignore[call-overload]
-        decayed = [p for p in self.network.parameters() if p.ndim > 1]
-        rest = [
-            p for p in self.network.parameters() if p.ndim <= 1
-        ]  # norms and biases are not pulled to zero
-        groups = [
-            {"params": decayed, "weight_decay": settings.weight_decay},
-            {"params": rest, "weight_decay": 0.0},
-        ]
-        self.optimiser = torch.optim.AdamW(groups, lr=settings.rate)
-        self.average = {name: value.clone() for name, value in self.network.state_dict().items()}
-        self.step, self.seconds, self.highest_rate = 0, 0.0, settings.rate
-
-    def save(self, path: Path, settings: Settings) -> None:
-        """Whole or not at all: a kill while writing keeps the last one."""
-        state = {
-            "network": self.network.state_dict(),
-            "average": self.average,
-            "optimiser": self.optimiser.state_dict(),
-            "step": self.step,
-            "seconds": self.seconds,
-            "highest_rate": self.highest_rate,
-            "width": settings.width,
-            "settings": {name: str(value) for name, value in asdict(settings).items()},
-        }
-        part = path.with_suffix(".part")
-        torch.save(state, part)
-        part.replace(path)
-
-    def load(self, path: Path, settings: Settings) -> None:
-        """Take up a checkpoint; says where its settings were others: the run cannot be repeated then."""
-        state = torch.load(path, weights_only=True, map_location=self.device)
-        if state["width"] != settings.width:
-            raise UnusableError(
-                f"{path}: of width {state['width']}, not {settings.width}; choose another --out"
-            )
-        for name, now in asdict(settings).items():
-            before = state["settings"].get(name)
-            if before != str(now):
-                print(f"{path}: {name} was {before} up to step {state['step']}, now {now}", flush=True)
-        self.network.load_state_dict(state["network"])
-        self.optimiser.load_state_dict(state["optimiser"])
-        self.average, self.step, self.seconds = state["average"], state["step"], state["seconds"]
-        self.highest_rate = state["highest_rate"]
-
-    def begin_from(self, weights: Path, rate: float) -> None:
-        """Take the weights of an exported model or of a checkpoint's running mean, and begin at step 0."""
-        load_weights(self.network, weights)
-        self.highest_rate = rate
-        self.average = {name: value.clone() for name, value in self.network.state_dict().items()}
-
-    def progress(self, settings: Settings) -> float:
-        """0 at the beginning, 1 at the end."""
-        if settings.minutes is not None:
-            return min(self.seconds / (60 * settings.minutes), 1.0)
-        return self.step / settings.steps
-
-    def follow(self, decay: float) -> None:
-        """Move the running mean of the weights a step towards them; faster while they are young."""
-        decay = min(decay, (1 + self.step) / (10 + self.step))
-        with torch.no_grad():
-            for name, value in self.network.state_dict().items():
-                if value.dtype.is_floating_point:
-                    self.average[name].lerp_(value, 1 - decay)
-                else:
-                    self.average[name].copy_(value)
-
-
-def averaged(run_folder: Path) -> WhaleDetector:
-    """The running mean of the weights of the newest checkpoint, ready to export."""
-    state = torch.load(run_folder / "checkpoint.pt", weights_only=True, map_location="cpu")
-    network = WhaleDetector(sizes=Sizes().scaled(state["width"]))
-    network.load_state_dict(state["average"])
-    return network.eval()
 
 
 def train(
@@ -154,15 +48,17 @@ def train(
     """
     cv2.setNumThreads(1)
     torch.set_num_threads(settings.threads)
+    given, checkpoint = Given(data, classes, begin_from), out / "checkpoint.pt"
+    run = _begun(checkpoint, settings, given)
+    if run.progress(settings) >= 1:
+        print(
+            f"already trained to the end, {run.step} steps: it is exported again; to train further choose "
+            f"another --out, and --from {checkpoint}",
+            flush=True,
+        )
+        return export(averaged(out), out / "detector.onnx", settings.pictures.side)
     # What was given is read before minutes are spent on rendering.
     own = own_pictures(data, classes) if data is not None else []
-    run, checkpoint = _Run(settings), out / "checkpoint.pt"
-    if checkpoint.is_file():
-        run.load(checkpoint, settings)
-        print(f"goes on at step {run.step}, {run.progress(settings):.0%} of the training", flush=True)
-    elif begin_from is not None:
-        run.begin_from(begin_from, settings.rate_from)
-        print(f"begins from {begin_from}", flush=True)
     out.mkdir(parents=True, exist_ok=True)
     batches = Batches(settings.pictures, out.parent / "detector_scenes", own)
     print(
@@ -182,9 +78,21 @@ def train(
             _report(run, settings, sums / 50, out / "log.csv")
             sums[:] = 0
         if run.step % settings.save_every_steps == 0:
-            run.save(checkpoint, settings)
-    run.save(checkpoint, settings)
+            run.save(checkpoint, settings, given)
+    run.save(checkpoint, settings, given)
     return export(averaged(out), out / "detector.onnx", settings.pictures.side)
+
+
+def _begun(checkpoint: Path, settings: Settings, given: Given) -> Run:
+    """A run as its checkpoint left it, or with the weights that are given, or new."""
+    run = Run(settings)
+    if checkpoint.is_file():
+        run.load(checkpoint, settings, given)
+        print(f"goes on at step {run.step}, {run.progress(settings):.0%} of the training", flush=True)
+    elif given.begin_from is not None:
+        run.begin_from(given.begin_from, settings.rate_from)
+        print(f"begins from {given.begin_from}", flush=True)
+    return run
 
 
 def _from(batches: Batches, step: int, workers: int) -> Iterator[tuple[Tensor, list[Tensor]]]:
@@ -205,7 +113,7 @@ def _rate(settings: Settings, rate: float, step: int, progress: float) -> float:
     return cosine * min((step + 1) / settings.warmup_steps, 1.0)
 
 
-def _step(run: _Run, settings: Settings, images: Tensor, boxes: list[Tensor]) -> NDArray[np.float64]:
+def _step(run: Run, settings: Settings, images: Tensor, boxes: list[Tensor]) -> NDArray[np.float64]:
     """One step of the optimiser on images (B, side, side, 3) uint8; returns (score loss, box loss)."""
     progress = run.progress(settings)
     for group in run.optimiser.param_groups:
@@ -242,7 +150,7 @@ def _short_floats_are_fast(device: torch.device) -> bool:
     return bool(torch.cpu._is_avx512_bf16_supported())
 
 
-def _report(run: _Run, settings: Settings, losses: NDArray[np.float64], log: Path) -> None:
+def _report(run: Run, settings: Settings, losses: NDArray[np.float64], log: Path) -> None:
     progress = run.progress(settings)
     rate = _rate(settings, run.highest_rate, run.step, progress)
     line = f"{run.step},{losses[0]:.4f},{losses[1]:.4f},{rate:.6f},{run.seconds:.0f},{progress:.4f}"
