@@ -7,6 +7,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from drivers.cameras.pinhole import Pinhole, Pose, apply_homography
 from drivers.sim.render import AnimalView, SeaRenderer
@@ -22,6 +25,7 @@ from drivers.sim.render.effects import (
 )
 from drivers.sim.render.species import species_named
 from tools.render import SPLITS, Scene, measured_right_whales, render_dataset, scenes
+from tools.render.dataset import corners_inside
 from tools.render.pods import varied
 from tools.render.scenes import _place
 from tools.render.visible import LEAST_CONTRAST, draw_and_see
@@ -54,6 +58,77 @@ def test_a_rendered_set_has_pictures_labels_truth_and_a_data_file(data_set: Path
     text = (data_set / "data.yaml").read_text()
     assert "train: images/train" in text
     assert "0: whale" in text
+
+
+def turned(points: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(4, 2) corners of the smallest turned box round (N, 2) points: what Ultralytics makes of a label."""
+    return np.asarray(cv2.boxPoints(cv2.minAreaRect(points.astype(np.float32))), np.float32)
+
+
+def share_alike(one: NDArray[np.float32], other: NDArray[np.float32]) -> float:
+    """IoU of two convex polygons, drawn in tenths of a pixel."""
+    low = np.floor(np.minimum(one.min(axis=0), other.min(axis=0)))
+    size = np.ceil(np.maximum(one.max(axis=0), other.max(axis=0)) - low).astype(int) * 10 + 2
+    drawn = [np.zeros((size[1], size[0]), np.uint8) for _ in range(2)]
+    for mask, corners in zip(drawn, (one, other), strict=True):
+        cv2.fillPoly(mask, [np.round((corners - low) * 10).astype(np.int32)], 1)
+    return float(np.sum(drawn[0] & drawn[1]) / np.sum(drawn[0] | drawn[1]))
+
+
+def test_turned_boxes_are_written_inside_the_picture_and_mean_the_same(data_set: Path) -> None:
+    n_outside = 0
+    for path in sorted((data_set / "oriented" / "train").glob("*.txt")):
+        truth = json.loads((data_set / "truth" / "train" / f"{path.stem}.json").read_text())
+        rows = np.loadtxt(path, np.float32, ndmin=2)
+        assert len(rows) == len(truth["ids"])
+        for row, given_box, upright in zip(rows, truth["oriented_px"], truth["boxes_px"], strict=True):
+            assert row.min() >= 0
+            assert row[1:].max() <= 1
+            corners, given_px = row[1:].reshape(4, 2) * (160, 120), np.array(given_box, np.float32)
+            assert share_alike(turned(corners), given_px) > 0.9
+            low, high = corners.min(axis=0), corners.max(axis=0)
+            shared = np.minimum(high, upright[2:]) - np.maximum(low, upright[:2])
+            whole = np.maximum(high, upright[2:]) - np.minimum(low, upright[:2])
+            assert shared.prod() > 0.6 * whole.prod(), "the box round the four corners is the upright one"
+            n_outside += int(np.any((given_px < 0) | (given_px > (160, 120))))
+    assert n_outside >= 3, "animals at the rim"
+
+
+def test_a_turned_box_inside_the_picture_is_written_as_it_is() -> None:
+    corners = np.array([[0, 10], [10, 0], [40, 30], [30, 40]], np.float32)
+    assert corners_inside(corners, (40, 40)) is corners
+
+
+def test_of_a_turned_box_that_the_rim_cuts_the_four_corners_that_span_most_stay() -> None:
+    """A square on its corner, whose left corner lies outside: cut at (0, 10) and (0, 30), of which one stays;
+    and a long one whose end is all outside, of which the whole rest stays.
+    """
+    square = np.array([[-10, 30], [20, 0], [50, 30], [20, 60]], np.float32)
+    cut = corners_inside(square, (60, 60))
+    assert cut.tolist() in [[[0, 20], [20, 0], [50, 30], [20, 60]], [[0, 40], [20, 0], [50, 30], [20, 60]]]
+    long = np.array([[-20, 10], [-10, 0], [30, 40], [20, 50]], np.float32)
+    np.testing.assert_allclose(
+        sorted(corners_inside(long, (60, 60)).tolist()), [[0, 10], [0, 30], [20, 50], [30, 40]], atol=1e-4
+    )
+
+
+@settings(deadline=None, max_examples=60)
+@given(st.lists(st.tuples(st.integers(0, 59), st.integers(0, 39)), min_size=3, max_size=12))
+def test_a_turned_box_round_any_pixels_is_cut_to_most_of_what_lies_inside(
+    pixels: list[tuple[int, int]],
+) -> None:
+    given_box = turned(np.array(pixels, np.float32) + 0.5)
+    cut = corners_inside(given_box, (60, 40))
+    assert cut.shape == (4, 2)
+    assert cut.min() >= 0
+    assert (cut <= (60, 40)).all()
+    for x, y in cut.tolist():
+        assert cv2.pointPolygonTest(given_box, (x, y), True) > -0.01
+    area = cv2.contourArea(given_box)
+    if area > 1:
+        inside = np.zeros((400, 600), np.uint8)
+        cv2.fillPoly(inside, [np.round(given_box * 10).astype(np.int32)], 1)
+        assert cv2.contourArea(cut) > 0.6 * np.sum(inside) / 100 - 2
 
 
 def test_scenes_depend_on_seed_and_index_alone() -> None:

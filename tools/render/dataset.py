@@ -1,10 +1,12 @@
 """Writes rendered scenes to a folder in the standard YOLO layout, with all that is known about them."""
 
 import json
+from itertools import combinations
 from pathlib import Path
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from tools.render.scenes import Scene, scenes
 
@@ -24,8 +26,9 @@ def render_dataset(
     """Write `n` scenes of `split`, `views` pictures of each, to `out` and return the path of its data.yaml.
 
     images/SPLIT/*.jpg; labels/SPLIT/*.txt, boxes as YOLO text; oriented/SPLIT/*.txt, turned boxes as four
-    corners (class x1 y1 ... x4 y4, shares of the picture); masks/SPLIT/*.png, 0 or an animal's id + 1;
-    truth/SPLIT/*.json, everything in px and metres with the 3x3 homography from pixels to ground metres.
+    corners (class x1 y1 ... x4 y4, shares of the picture from 0 to 1); masks/SPLIT/*.png, 0 or an animal's
+    id + 1; truth/SPLIT/*.json, everything in px and metres with the 3x3 homography from pixels to ground
+    metres, and turned boxes as they lie, also where a corner is outside the picture.
     The views of a scene show the same animals under the same ids. Raises ValueError for a bad split or count.
     """
     if n < 1 or views < 1:
@@ -52,8 +55,25 @@ def _box_lines(scene: Scene, side: tuple[int, int]) -> str:
 
 
 def _corner_lines(scene: Scene, side: tuple[int, int]) -> str:
-    rows = (scene.oriented / side).reshape(-1, 8)
-    return "".join("0 " + " ".join(f"{value:.6f}" for value in row) + "\n" for row in rows.tolist())
+    rows = [(corners_inside(corners, side) / side).reshape(8).tolist() for corners in scene.oriented]
+    return "".join("0 " + " ".join(f"{value:.6f}" for value in row) + "\n" for row in rows)
+
+
+def corners_inside(corners: NDArray[np.float32], side: tuple[int, int]) -> NDArray[np.float32]:
+    """A turned box (4, 2) px as four corners inside a picture of `side` (width, height).
+
+    Ultralytics refuses a picture with a corner outside it, and takes the smallest turned box round the four.
+    So of the part inside, which has up to eight corners, those four stay that span most of it: the box round
+    them is the one given. Moved to the rim one by one, the corners would leave out more of what shows there.
+    """
+    if np.all((corners >= 0) & (corners <= side)):
+        return corners
+    width, height = side
+    picture = np.array([[0, 0], [width, 0], [width, height], [0, height]], np.float32)
+    _, part = cv2.intersectConvexConvex(corners, picture)
+    spans = combinations(part.reshape(-1, 2), 4)  # in their order round it
+    largest = max((np.stack(four) for four in spans), key=lambda four: float(cv2.contourArea(four)))
+    return np.asarray(np.clip(largest, 0, side), np.float32)
 
 
 def _truth(scene: Scene) -> dict[str, object]:
