@@ -73,6 +73,8 @@ def layout_of(
         elif class_count is not None:
             if rows == 4 + extra + class_count:
                 return Layout("raw", oriented)
+            if columns == 5 + class_count and not oriented:  # an oriented one with so many lies on its side
+                raise ValueError(f"output shape {tuple(shape)} is {YOLOV5}")
         elif rows > 4 + extra and not rows > max(columns, 100):  # more rows than cells: turned on its side
             return Layout("raw", oriented)
     expected = "4 + classes" if class_count is None else str(4 + class_count)

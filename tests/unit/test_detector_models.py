@@ -57,12 +57,9 @@ def test_a_layout_is_told_by_head_then_last_dimension_then_first(
     ("shape", "class_count", "task", "head"),
     [
         ((1, 8400, 84), 80, "detect", ""),  # on its side
-        ((1, 25200, 85), 80, "detect", ""),  # v5: with an objectness
-        ((1, 25200, 6), 1, None, ""),
-        ((1, 6300, 7), 2, None, ""),
-        ((1, 25200, 7), None, None, ""),
         ((1, 8400, 84), None, None, ""),
         ((1, 85, 8400), 80, "detect", ""),
+        ((1, 8400, 20), 15, "obb", ""),  # on its side: as many columns as a v5 of 15 classes
         ((1, 84, 8400), 80, "obb", ""),
         ((1, 300, 7), 80, "detect", ""),  # an angle in a model that says it has none
         ((1, 300, 6), 15, "obb", ""),  # and none where it says that it has one
@@ -78,7 +75,27 @@ def test_any_other_layout_is_an_error_that_names_the_shape(
 ) -> None:
     with pytest.raises(ValueError) as caught:
         layout_of(shape, class_count, task, head)
-    assert str(shape) in str(caught.value)
+    assert f"output shape {shape} is neither" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("shape", "class_count", "task"),
+    [
+        ((1, 25200, 85), 80, None),  # yolov5s of 640 px, as it comes: with an objectness, without a task
+        ((1, 25200, 85), 80, "detect"),
+        ((1, 252, 8), 3, None),
+        ((1, 25200, 6), 1, None),
+        ((1, 6300, 7), 2, None),
+        ((1, 25200, 7), None, None),
+    ],
+)
+def test_a_yolov5_is_told_by_its_shape(
+    shape: tuple[int, ...], class_count: int | None, task: str | None
+) -> None:
+    with pytest.raises(ValueError) as caught:
+        layout_of(shape, class_count, task)
+    assert f"output shape {shape} is centre, size, objectness" in str(caught.value)
+    assert "train a yolov5nu or a later model" in str(caught.value)
 
 
 def yolov5(n_classes: int, rows: int, seed: int) -> np.ndarray:
@@ -92,8 +109,15 @@ def yolov5(n_classes: int, rows: int, seed: int) -> np.ndarray:
     return output
 
 
+def test_a_yolov5_of_80_classes_is_named_with_the_remedy(tmp_path: Path) -> None:
+    names = {"names": str({number: f"class {number}" for number in range(80)}), "stride": "32"}
+    path = network(tmp_path / "yolov5s.onnx", yolov5(80, 252, 0), names)
+    with pytest.raises(ModelError, match=r"yolov5s\.onnx: output shape .*YOLOv5 .*train a yolov5nu"):
+        Detector(path)
+
+
 @pytest.mark.parametrize("classes", [1, 2])
-def test_a_yolov5_is_named_with_the_remedy(tmp_path: Path, classes: int) -> None:
+def test_a_yolov5_of_few_classes_is_named_with_the_remedy(tmp_path: Path, classes: int) -> None:
     """At the start where it has thousands of rows, else with the first animal."""
     names = {"names": TWO["names"] if classes == 2 else NAMES["names"]}
     large = network(tmp_path / "large.onnx", yolov5(classes, 25200, 1), names)
