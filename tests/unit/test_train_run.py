@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -12,7 +13,7 @@ from tools.errors import UNUSABLE, UnusableError
 from tools.train.detector import training
 from tools.train.detector.pictures import Mixture
 from tools.train.detector.run import Given, Run, Settings
-from tools.train.detector.training import train
+from tools.train.detector.training import LOG_COLUMNS, train
 
 torch.set_num_threads(1)  # on a busy machine two wait for each other
 PICTURES = Mixture(batch=2, side=64, scenes=2)
@@ -140,3 +141,24 @@ def test_the_same_command_after_the_end_exports_again_and_other_settings_are_ref
         UnusableError, match=r"pictures was .*changes nothing: it is trained to the end; choose"
     ):
         train(tmp_path, replace(TINY, pictures=replace(PICTURES, seed=7)))
+
+
+def test_the_log_of_a_killed_run_ends_at_its_checkpoint_and_names_its_columns(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stopped(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(training, "_step", stopped)
+    monkeypatch.setattr(training, "_from", lambda *_: iter([(None, None)]))
+    monkeypatch.setattr(
+        training, "Batches", lambda *_: SimpleNamespace(rendered=[], empty=[], photographs=[])
+    )
+    settings, log = replace(TINY, steps=200), tmp_path / "log.csv"
+    rows = [f"{step},2.5,1.25,0.001,{second},0.5" for second, step in enumerate((50, 100, 100, 150))]
+    log.write_text("\n".join([*rows, "200,1.9"]))  # killed while it wrote a row, and once before that
+    for step, kept in ((100, [rows[0], rows[2]]), (100, [rows[0], rows[2]]), (0, [])):
+        left(tmp_path, step, Given())
+        with pytest.raises(KeyboardInterrupt):
+            train(tmp_path, settings)
+        assert log.read_text().splitlines() == [LOG_COLUMNS, *kept]

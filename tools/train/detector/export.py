@@ -26,7 +26,7 @@ LARGEST_DIFFERENCE = 0.05  # px and score: float32 sums in another order differ 
 
 
 def export(network: WhaleDetector, path: Path, side: int) -> Path:
-    """Write `network`: input `images` (1, 3, side, side) RGB 0-1, output `output0` (1, 4 + nc, A)."""
+    """Write `network`: input `images` (1, 3, side, side) RGB 0-1, output `output0` (1, 5, A)."""
     part = path.with_suffix(".part.onnx")
     with warnings.catch_warnings():
         # The exporter without extra packages is the older one, which says on every call that it is older.

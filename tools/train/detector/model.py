@@ -85,12 +85,11 @@ class Pooling(nn.Module):
 
 
 class WhaleDetector(nn.Module):
-    """(B, 3, H, W) RGB in 0-1, H and W multiples of 32 -> logits (B, nc, A) and side distances (B, 4, A)."""
+    """(B, 3, H, W) RGB in 0-1, H and W multiples of 32 -> logits (B, 1, A) and side distances (B, 4, A)."""
 
-    def __init__(self, classes: int = 1, sizes: Sizes | None = None) -> None:
+    def __init__(self, sizes: Sizes | None = None) -> None:
         super().__init__()
         c = sizes or Sizes()
-        self.classes = classes
         self.to_s4 = nn.Sequential(ConvUnit(3, c.stem, 3, 2), ConvUnit(c.stem, c.s4, 3, 2), SplitBlock(c.s4))
         self.to_s8 = nn.Sequential(ConvUnit(c.s4, c.s8, 3, 2), SplitBlock(c.s8), SplitBlock(c.s8))
         self.to_s16 = nn.Sequential(ConvUnit(c.s8, c.s16, 3, 2), SplitBlock(c.s16), SplitBlock(c.s16))
@@ -100,8 +99,7 @@ class WhaleDetector(nn.Module):
         self.smooth16, self.smooth8 = SplitBlock(c.head), SplitBlock(c.head)
         self.down16, self.down32 = ConvUnit(c.head, c.head, 3, 2), ConvUnit(c.head, c.head, 3, 2)
         self.heads = nn.ModuleList(
-            nn.Sequential(SplitBlock(n), nn.Conv2d(n, 4 + classes, 1))
-            for n in (c.finest_head, c.head, c.head, c.head)
+            nn.Sequential(SplitBlock(n), nn.Conv2d(n, 5, 1)) for n in (c.finest_head, c.head, c.head, c.head)
         )
         for head in self.heads:
             bias = head.get_parameter("1.bias")
@@ -126,7 +124,7 @@ class WhaleDetector(nn.Module):
         top = top + self.down32(middle)
         levels = (finest, fine, middle, top)
         grids = [head(level).flatten(2) for head, level in zip(self.heads, levels, strict=True)]
-        out = torch.cat(grids, 2)  # (B, 4 + nc, A), A = HW (1/16 + 1/64 + 1/256 + 1/1024)
+        out = torch.cat(grids, 2)  # (B, 5, A), A = HW (1/16 + 1/64 + 1/256 + 1/1024)
         return out[:, 4:], nn.functional.softplus(out[:, :4])
 
 
@@ -150,7 +148,7 @@ def decode(distances: Tensor, centres: Tensor, strides: Tensor) -> Tensor:
 
 
 class Exported(nn.Module):
-    """The network in the Ultralytics raw layout: (B, 4 + nc, A) of cx, cy, w, h px, then scores 0-1."""
+    """The network in the Ultralytics raw layout: (B, 5, A) of cx, cy, w, h px, then the score 0-1."""
 
     def __init__(self, network: WhaleDetector, side: int) -> None:
         super().__init__()
@@ -163,4 +161,4 @@ class Exported(nn.Module):
         logits, distances = self.network(images)
         sides = distances * self.strides  # (B, 4, A)
         low, high = self.centres - sides[:, :2], self.centres + sides[:, 2:]  # (B, 2, A)
-        return torch.cat([(low + high) / 2, high - low, logits.sigmoid()], 1)  # (B, 4 + nc, A)
+        return torch.cat([(low + high) / 2, high - low, logits.sigmoid()], 1)  # (B, 5, A)

@@ -23,6 +23,7 @@ from drivers.sim.render.effects import (
     noisy,
     vignetted,
 )
+from procs.detector.letterbox import PAD_GREY
 from tools.errors import UnusableError
 from tools.render import measured_right_whales, scenes
 from tools.train.detector.labels import read_labels
@@ -52,7 +53,6 @@ Boxes = NDArray[np.float32]
 CACHE_SIDE = 384  # a little over the network's 320, so that crops and scales vary
 # Photographs that show a second animal in part, without a box: boxes on it are neither right nor wrong.
 WITH_EXTRAS = ("w_6", "w_23", "w_33", "w_94")
-PAD_GREY = 114  # what the detector puts round pictures that are not square
 SCENES_VERSION = 2  # raised whenever the scenes change: what was kept of older ones is left alone
 LEAST_PICTURE_PX = 32  # what is left of smaller ones is no picture
 LEAST_SHARE = 0.35  # of a box that a crop must keep for the animal to count

@@ -32,6 +32,8 @@ from tools.train.detector.run import Given, Run, Settings, averaged
 
 __all__ = ["Settings", "averaged", "command", "settings_of", "train"]
 
+LOG_COLUMNS = "step,score_loss,box_loss,rate,seconds,progress"
+
 
 def train(
     out: Path,
@@ -67,6 +69,7 @@ def train(
         f"with {sum(len(sample.boxes) for sample in own)} animals",
         flush=True,
     )
+    _cut_log(out / "log.csv", run.step)
     run.network.train()
     sums, begun = np.zeros(2), time.monotonic() - run.seconds
     for images, boxes in _from(batches, run.step, settings.workers):
@@ -154,9 +157,21 @@ def _report(run: Run, settings: Settings, losses: NDArray[np.float64], log: Path
     progress = run.progress(settings)
     rate = _rate(settings, run.highest_rate, run.step, progress)
     line = f"{run.step},{losses[0]:.4f},{losses[1]:.4f},{rate:.6f},{run.seconds:.0f},{progress:.4f}"
-    print(f"step,score_loss,box_loss,rate,seconds,progress {line}", flush=True)
+    print(f"{LOG_COLUMNS} {line}", flush=True)
     with log.open("a") as file:
         file.write(line + "\n")
+
+
+def _cut_log(log: Path, step: int) -> None:
+    """Begin the log, or end it at the step from which the run goes on: a killed run was further."""
+    rows = {}
+    for line in log.read_text().splitlines() if log.is_file() else []:
+        number = line.partition(",")[0]
+        if number.isdecimal() and line.count(",") == LOG_COLUMNS.count(",") and int(number) <= step:
+            rows[int(number)] = line
+    part = log.with_suffix(".part")
+    part.write_text("\n".join([LOG_COLUMNS, *rows.values()]) + "\n")
+    part.replace(log)
 
 
 def settings_of(
