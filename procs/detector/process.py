@@ -3,7 +3,8 @@
 Hears FRAME, and VEHICLE_STATE to know how large an animal should look. Says DETECTIONS at most at
 camera.detect_hz, with the frame's instant of capture; a frame without animals gives a message without boxes.
 A frame that is gone from the ring is skipped and counted. When FRAME dies, or in the air its pictures stay
-the same to the last bit for a second, it falls silent: presence fades and nobody acts on old boxes. A model
+the same to the last bit for a second, it falls silent: presence fades and nobody acts on old boxes. A drone
+whose VEHICLE_STATE it never heard stands: a bench without autopilot may show one picture for ever. A model
 that is missing or broken ends the process with exit code 3 and the remedy. On SIGHUP it reads its settings
 and the model again, while the old one works on; a new model that cannot be used leaves the old one at work,
 and the heartbeat says so.
@@ -39,7 +40,7 @@ class DetectorShell:
         self._n_reloads = 0
         self._last_utime = 0
         self._changed_utime = 0  # capture of the newest frame that was unlike the one before it
-        self._is_landed = False
+        self._is_landed = True  # until the autopilot says otherwise
         self._height_m = 0.0
         self._height_utime = 0
 

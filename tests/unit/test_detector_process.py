@@ -90,6 +90,7 @@ def test_a_camera_that_hangs_for_a_second_gets_no_answer() -> None:
     detector = Recorder()
     drone = bench(detector)
     drone.run(1.0)
+    fly_at(drone, 40.0)
     for number in range(10):
         detector.n_repeats = number
         show(drone, number)
@@ -104,15 +105,42 @@ def test_a_camera_that_hangs_for_a_second_gets_no_answer() -> None:
     assert drone.beat.status == heartbeat_t.OK
 
 
-def test_on_the_ground_a_view_may_lie_still() -> None:
+@pytest.mark.parametrize("has_autopilot", [True, False])
+def test_on_the_ground_and_on_a_bench_a_view_may_lie_still(has_autopilot: bool) -> None:
     detector = Recorder()
     drone = bench(detector)
     drone.run(1.0)
-    drone.say(channels.VEHICLE_STATE, make(vehicle_state_t, position_ok=True, landed=True))
+    if has_autopilot:
+        drone.say(channels.VEHICLE_STATE, make(vehicle_state_t, position_ok=True, landed=True))
     for number in range(10):
         detector.n_repeats = number
         show(drone, number)
     assert drone.count(channels.DETECTIONS) == 10
+    assert drone.beat.status == heartbeat_t.OK
+
+
+def test_an_autopilot_that_falls_silent_in_the_air_leaves_the_drone_in_the_air() -> None:
+    detector = Recorder()
+    drone = bench(detector)
+    drone.run(1.0)
+    fly_at(drone, 40.0)
+    drone.run(5.0)
+    for number in range(10):
+        detector.n_repeats = number
+        show(drone, number)
+    assert drone.count(channels.DETECTIONS) == 5
+
+
+def test_a_drone_that_takes_off_has_a_second_to_see_another_picture() -> None:
+    detector = Recorder()
+    drone = bench(detector)
+    drone.run(1.0)
+    for number in range(20):
+        detector.n_repeats = number
+        if number == 10:
+            fly_at(drone, 3.0)
+        show(drone, number)
+    assert 14 <= drone.count(channels.DETECTIONS) <= 15, "ten on the ground, and a second's"
 
 
 def test_what_is_wrong_with_a_picture_goes_to_the_heartbeat(tmp_path: Path) -> None:
