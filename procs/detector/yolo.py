@@ -112,7 +112,8 @@ class Detector:
             piece = self._look(image[top:bottom, left:right], timings)
             begun = time.perf_counter()
             piece = piece._replace(boxes=piece.boxes + np.array([left, top, left, top], np.float32))
-            piece = owned(piece, tile, (width, height), (right - left) / self.input_size[0])
+            shrink = max((right - left) / self.input_size[0], (bottom - top) / self.input_size[1])
+            piece = owned(piece, tile, (width, height), shrink)
             looks.append(piece.take(~pieces(piece, whole, min(right - left, bottom - top))))
             timings["decode"] += (time.perf_counter() - begun) * 1e3
         begun = time.perf_counter()

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from procs.detector.decode import Candidates
 from procs.detector.tiles import SeenLength, Tile, merge, owned, pieces, plan, shortfall
 from procs.detector.yolo import Detections, Detector
-from tests.unit.detector_networks import blob_network, network, raw
+from tests.unit.detector_networks import NAMES, blob_network, network, raw
 
 INPUT = (320, 320)
 DATA = Path(os.environ.get("PODWATCH_REAL_DATA", Path(__file__).parents[3] / "shared" / "data"))
@@ -153,6 +153,18 @@ def test_tiling_finds_in_tiles_and_reports_in_the_whole_picture(tmp_path: Path) 
     middles = sorted(((found.boxes[:, 0] + found.boxes[:, 2]) / 2).round(3).tolist())
     assert middles == [32.0, 56.0, 80.0]
     assert found.n_looks == 3
+
+
+def test_how_near_the_cut_a_box_may_end_is_told_by_the_side_that_shrinks_more(tmp_path: Path) -> None:
+    """Tiles of 640 x 640 px at 640 x 384 shrink by 5 / 3, so 4 px of the input are 6.7 px of the picture: a box
+    that ends 5 px before the cut is a piece. The second tile ends with the picture, where nothing is cut.
+    """
+    box = raw((462.5, 192, 93, 60, 0.9))  # 480 to 635 px in a tile: its centre is the first tile's own
+    model = network(tmp_path / "raw.onnx", box, {**NAMES, "imgsz": "[384, 640]"}, shape=(1, 3, 384, 640))
+    picture = np.random.default_rng(2).integers(0, 255, (640, 1120, 3), dtype=np.uint8)
+    found = Detector(model, tile=640).detect(picture)
+    assert found.n_looks == 3
+    assert sorted(found.boxes[:, 0].round().tolist()) == [728, 960], "the whole picture's, the second tile's"
 
 
 def seen_at(detector: Detector, boxes: list[tuple[int, int, int, int]], size: tuple[int, int]) -> Detections:
