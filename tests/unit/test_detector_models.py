@@ -151,6 +151,21 @@ def test_finished_boxes_are_filtered_by_score_alone(tmp_path: Path) -> None:
     assert [found.names[number] for number in found.classes.tolist()] == ["whale", "whale"]
 
 
+@pytest.mark.parametrize("metadata", [NAMES, OBB], ids=["upright", "oriented"])
+def test_rows_that_fill_a_finished_output_up_are_no_boxes_at_any_confidence(
+    tmp_path: Path, metadata: dict[str, str]
+) -> None:
+    """Every exporter fills up with zeros; a picture without animals has nothing else."""
+    angle = (0.0,) if metadata is OBB else ()
+    row = (20, 25, 40, 50, 0.1, 0, *angle)
+    for rows, n_found in (((row,), 1), ((tuple(0.0 for _ in row),), 0)):
+        model = network(tmp_path / "done.onnx", table(*rows), metadata)
+        assert len(Detector(model, confidence=0).detect(PICTURE)) == n_found
+    yolov5 = [(20.5, 25.5, 10.5, 12.5, 0.3, 0.7, *angle)] * 3
+    with pytest.raises(ModelError, match="3 of 3 rows above the confidence"):
+        Detector(network(tmp_path / "v5.onnx", table(*yolov5), metadata), confidence=0).detect(PICTURE)
+
+
 def test_boxes_come_best_first_whatever_the_networks_order(tmp_path: Path) -> None:
     output = table((10, 10, 20, 20, 0.3, 0), (30, 30, 50, 50, 0.9, 0), (50, 0, 60, 9, 0.6, 0))
     found = Detector(network(tmp_path / "done.onnx", output)).detect(PICTURE)
