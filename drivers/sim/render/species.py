@@ -3,7 +3,7 @@
 The body runs from the tip of the snout (station 0) to the notch between the flukes (station 1). Widths were
 set from published photogrammetry and field guides; the minke's are the 19 widths that come with the
 photogrammetry example of MorphoMetriX. Training may replace the right whale's by measured outlines
-(tools/render.py).
+(tools/render/outlines.py).
 """
 
 from dataclasses import dataclass, replace
