@@ -114,7 +114,7 @@ def _raw(output: NDArray[np.float32], oriented: bool, confidence: float) -> Cand
 def _finished(output: NDArray[np.float32], oriented: bool, confidence: float) -> Candidates:
     """x0, y0, x1, y1, score, class; an oriented box: centre x, y, width, height, score, class, angle."""
     rows = output[0]
-    # Whatever the confidence: a score of 0 is a row that the exporter filled up with. NaN stays, to be counted.
+    # Whatever the confidence, a score of 0 is a row that only fills the output up. NaN stays, to be counted.
     rows = rows[~((rows[:, 4] < confidence) | (rows[:, 4] <= 0))]
     classes = np.nan_to_num(rows[:, 5]).astype(np.int64)
     if oriented:

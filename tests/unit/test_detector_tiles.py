@@ -156,8 +156,8 @@ def test_tiling_finds_in_tiles_and_reports_in_the_whole_picture(tmp_path: Path) 
 
 
 def test_how_near_the_cut_a_box_may_end_is_told_by_the_side_that_shrinks_more(tmp_path: Path) -> None:
-    """Tiles of 640 x 640 px at 640 x 384 shrink by 5 / 3, so 4 px of the input are 6.7 px of the picture: a box
-    that ends 5 px before the cut is a piece. The second tile ends with the picture, where nothing is cut.
+    """Tiles of 640 x 640 px at 640 x 384 shrink by 5 / 3: 4 px of the input are 6.7 px of the picture, so
+    what ends 5 px before the cut is a piece. The second tile ends with the picture, where nothing is cut.
     """
     box = raw((462.5, 192, 93, 60, 0.9))  # 480 to 635 px in a tile: its centre is the first tile's own
     model = network(tmp_path / "raw.onnx", box, {**NAMES, "imgsz": "[384, 640]"}, shape=(1, 3, 384, 640))
