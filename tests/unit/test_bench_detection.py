@@ -1,14 +1,16 @@
 """The detection benchmark in small: its figures by hand, and a floor under the model that ships."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from procs.detector.yolo import Detections, Detector
-from tools.bench import detection
-from tools.bench.detection import available, command
+from tools.bench import detection, detection_corruptions, detection_speed
+from tools.bench.detection import Measures, available, command
+from tools.bench.detection_corruptions import Corruption, corruptions
 from tools.bench.detection_figures import cells
 from tools.bench.detection_measure import Animal, Tally, held_out_photographs, look, open_detector, rendered
 from tools.bench.table import Row
@@ -58,6 +60,67 @@ def test_a_box_on_a_faint_animal_is_no_false_alarm_but_is_told() -> None:
     assert made.counts() == (len(scene.boxes), 0, 0)
     assert made.faint_found == made.faint == len(scene.faint)
     assert all(item.score == 1 for item in made.animals)
+
+
+def test_a_box_on_an_animal_that_counts_is_not_told_of_a_faint_one_under_it() -> None:
+    scene = next(item for item in rendered(40, 3, "val") if len(item.boxes))
+    counted = scene.boxes[:1]
+    grown = counted + np.array([-9, -9, 9, 9], np.float32)
+    beside = np.array([[*counted[0, :2] - 9, *counted[0, :2] + 3]], np.float32)  # in the corner of the faint
+    below = replace(
+        scene,
+        boxes=counted,
+        depth_m=scene.depth_m[:1],
+        contrast=scene.contrast[:1],
+        faint=grown,
+    )
+
+    class Known:
+        input_size = (320, 320)
+
+        def __init__(self, *boxes: np.ndarray) -> None:
+            self.boxes = np.concatenate(boxes)
+
+        def detect(self, image: np.ndarray) -> Detections:
+            scores = np.linspace(0.9, 0.6, len(self.boxes), dtype=np.float32)
+            return Detections(self.boxes, scores, np.zeros(len(self.boxes), np.int64), {0: "whale"})
+
+    for boxes, n_faint in (((counted,), 0), ((counted, beside), 1), ((beside,), 1)):
+        made = look({"known": Known(*boxes)}, [below])["known"]  # type: ignore[dict-item]
+        assert (made.faint_found, made.faint) == (n_faint, 1)
+
+
+def test_with_a_model_of_ones_own_the_others_are_not_called_missing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        detection,
+        "sets",
+        lambda m: [("frames", lambda: detection._frame_rows(m)), ("time", lambda: detection._time_rows(m))],
+    )
+    monkeypatch.setattr(detection_speed, "speed", lambda path: {"infer": 5.0, "outside": 0.5})
+    command(1, tmp_path, most=1, model=available()["ours"])
+    rows = json.loads((tmp_path / "bench_detection.json").read_text())
+    absent = [row for row in rows if row["figure"] is None]
+    assert [row["name"] for row in absent[:2]] == ["Table 1, half width", "Table 1, int8"]
+    assert absent[2]["name"].endswith("one thread, int8")
+    assert {row["why"] for row in absent} == {"not measured with --model"}
+    m = Measures(1, 1, {"ours": available()["ours"]})
+    whys = [row.why for row in detection._frame_rows(m) if row.figure is None]
+    assert whys == ["there is no models/detector_half.onnx", "there is no models/detector_int8.onnx"]
+
+
+def test_a_corruption_that_is_not_survived_is_named_with_the_reason(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    silent = Corruption("silent", "picture", "on fire", lambda good, _random: good[::-1])
+    monkeypatch.setattr(detection_corruptions, "corruptions", lambda: [corruptions()[0], silent])
+    (row,) = detection._corruption_rows(Measures(1, paths=available()))
+    assert (row.figure, row.passed) == ("1 of 2", False)
+    assert row.why == "silent: no heartbeat said 'on fire', they said: ok"
+    monkeypatch.setattr(detection_corruptions, "survival", lambda path: ({"silent": row.why[8:]}, 2))
+    detection_corruptions.main()
+    assert capsys.readouterr().out == f"{row.why}\n1 of 2 survived\n"
 
 
 @pytest.mark.timeout(240)

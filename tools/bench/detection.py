@@ -52,6 +52,7 @@ class Measures:
     seed: int
     most: int = FRAMES  # scenes a set
     paths: dict[str, Path] = field(default_factory=dict)  # by model
+    is_own: bool = False  # the caller's own model, beside which no other is measured
     frames: dict[str, Tally] = field(default_factory=dict)  # by model
     counts: dict[int, Tally] = field(default_factory=dict)  # by number of animals, ours
 
@@ -61,6 +62,10 @@ class Measures:
 
     def scenes(self, full: int) -> int:
         return min(full, self.most)
+
+    def why_missing(self, name: str) -> str:
+        """Why a model that ships is not among those measured."""
+        return "not measured with --model" if self.is_own else f"there is no models/{FILES[name]}"
 
 
 def available(model: Path | None = None) -> dict[str, Path]:
@@ -90,7 +95,7 @@ def _frame_rows(m: Measures) -> Iterator[Row]:
     )
     for name in FILES:
         if name not in m.frames:
-            yield Row(f"Table 1, {name}", n, seed, None, why=f"there is no models/{FILES[name]}")
+            yield Row(f"Table 1, {name}", n, seed, None, why=m.why_missing(name))
             continue
         yield from _table_1(f"Table 1, {name}", m.frames[name], n, seed)
 
@@ -185,7 +190,7 @@ def _time_rows(m: Measures) -> Iterator[Row]:
     for name, floor, aim in (("ours", 10.0, 5.0), ("int8", 7.0, 3.0)):
         title = f"ms an image at 320 from 720p, one thread, {'float' if name == 'ours' else name}"
         if name not in m.paths:
-            yield Row(title, 0, "-", None, why=f"there is no models/{FILES[name]}")
+            yield Row(title, 0, "-", None, why=m.why_missing(name))
             continue
         parts = speed(m.paths[name])
         whole, outside = parts["infer"] + parts["outside"], parts["outside"]
@@ -198,8 +203,9 @@ def _time_rows(m: Measures) -> Iterator[Row]:
 def _corruption_rows(m: Measures) -> Iterator[Row]:
     from tools.bench.detection_corruptions import survival
 
-    survived, n = survival(m.paths["ours"])
-    yield Row("corruptions of the input survived", n, "-", f"{survived} of {n}", "all", "all", survived == n)
+    problems, n = survival(m.paths["ours"])
+    figure, why = f"{n - len(problems)} of {n}", "; ".join(f"{name}: {why}" for name, why in problems.items())
+    yield Row("corruptions of the input survived", n, "-", figure, "all", "all", not problems, why)
 
 
 def sets(m: Measures) -> list[tuple[str, Callable[[], Iterator[Row]]]]:
@@ -217,21 +223,18 @@ def sets(m: Measures) -> list[tuple[str, Callable[[], Iterator[Row]]]]:
     ]
 
 
-def command(
-    seed: int, out: Path, *, most: int = FRAMES, model: Path | None = None, draw_into: Path | None = None
-) -> None:
+def command(seed: int, out: Path, *, most: int = FRAMES, model: Path | None = None) -> None:
     """Measure all, print the table, write bench_detection.json and the figures.
 
     most: scenes a set, of those that the bars ask for. model: another ONNX file than the one that ships.
-    draw_into: folder of the figures, `out` where None.
     """
     console = bench_console()
-    m = Measures(seed, most, available(model))
+    m = Measures(seed, most, available(model), is_own=model is not None)
     rows: list[Row] = []
     for name, measure in sets(m):
         with console.status(name):
             rows += measured(measure(), name)
     print_table(f"podwatch bench detection, confidence {CONFIDENCE}", rows, console)
     write_table(out / "bench_detection.json", rows)
-    for path in draw(m.frames.get("ours"), m.counts, draw_into or out):
+    for path in draw(m.frames.get("ours"), m.counts, out):
         console.print(f"Figure: {path}", highlight=False)

@@ -68,12 +68,10 @@ def corruptions() -> list[Corruption]:
     ]
 
 
-def survival(model_path: str | Path | None = None) -> tuple[int, int]:
-    """(survived, tried)."""
-    detector = Detector(model_path)
-    tried = corruptions()
-    survived = [one for one in tried if why_not(one, detector, good_picture()) == ""]
-    return len(survived), len(tried)
+def survival(model_path: str | Path | None = None) -> tuple[dict[str, str], int]:
+    """(why not, for people, by the name of each that was not survived; how many were tried)."""
+    detector, good, tried = Detector(model_path), good_picture(), corruptions()
+    return {one.name: why for one in tried if (why := why_not(one, detector, good))}, len(tried)
 
 
 def why_not(corruption: Corruption, detector: Detector, good: Image) -> str:
@@ -257,13 +255,10 @@ class _Drone:
 def main() -> None:
     """Print each that is not survived, and the count."""
     cv2.setNumThreads(1)
-    detector = Detector(sys.argv[1] if len(sys.argv) > 1 else None)
-    tried = corruptions()
-    good = good_picture()
-    problems = {one.name: why for one in tried if (why := why_not(one, detector, good))}
+    problems, n_tried = survival(sys.argv[1] if len(sys.argv) > 1 else None)
     for name, why in problems.items():
         print(f"{name}: {why}")
-    print(f"{len(tried) - len(problems)} of {len(tried)} survived")
+    print(f"{n_tried - len(problems)} of {n_tried} survived")
 
 
 if __name__ == "__main__":

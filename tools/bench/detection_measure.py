@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from procs.detector.yolo import Detector
+from procs.detector.yolo import Detections, Detector
 from tools.render import Scene, scenes
 from tools.train.detector.samples import WITH_EXTRAS, held_out, read_yolo, real_data
-from tools.train.detector.scores import average_precision, match, match_animals
+from tools.train.detector.scores import MATCH_IOU, average_precision, box_iou, match, match_animals
 
 __all__ = [
     "CONFIDENCE",
@@ -54,7 +54,7 @@ class Tally:
     boxes_a_picture: list[NDArray[np.float64]] = field(default_factory=list)  # scores of those boxes
     animals_a_picture: list[int] = field(default_factory=list)
     faint: int = 0  # animals that show too little to count
-    faint_found: int = 0
+    faint_found: int = 0  # by a box that found no animal that counts
 
     @property
     def pictures(self) -> int:
@@ -91,9 +91,9 @@ def look(detectors: Mapping[str, Detector], pictures: Iterable[Scene]) -> dict[s
             results, scores = match_animals(found, known)
             _add(tally, results, len(scene.boxes))
             tally.animals += list(_animals(scene, scores, detector.input_size))
-            sure = found.boxes[found.scores >= CONFIDENCE]
+            free = found.boxes[(found.scores >= CONFIDENCE) & ~_on_counted(found, scene.boxes, scores)]
             tally.faint += len(scene.faint)
-            tally.faint_found += sum(_lies_in(box, sure) for box in scene.faint)
+            tally.faint_found += sum(_lies_in(box, free) for box in scene.faint)
     return tallies
 
 
@@ -124,6 +124,14 @@ def _animals(scene: Scene, scores: NDArray[np.float32], input_size: tuple[int, i
             scene.conditions.sea_state,
             scene.kind == "grass",
         )
+
+
+def _on_counted(
+    found: Detections, counted: NDArray[np.float32], scores: NDArray[np.float32]
+) -> NDArray[np.bool_]:
+    """(N,) which boxes are those that found an animal that counts, each with the score noted of it."""
+    with_its_score = found.scores[:, None] == scores[None]
+    return np.asarray((with_its_score & (box_iou(found.boxes, counted) >= MATCH_IOU)).any(axis=1))
 
 
 def _lies_in(box: NDArray[np.float32], found: NDArray[np.float32]) -> bool:
