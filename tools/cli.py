@@ -94,6 +94,10 @@ def train_detector(
     minutes: Annotated[float | None, typer.Option(min=0.1, help="As many steps as fit.")] = None,
     seed: Annotated[int, typer.Option(min=0)] = 0,
     threads: Annotated[int, typer.Option(min=1, help="More than one: for an idle machine.")] = 1,
+    workers: Annotated[
+        int | None,
+        typer.Option(min=0, help="Processes that make pictures; usually 1, with CUDA all but one processor."),
+    ] = None,
     int8: Annotated[bool, typer.Option("--int8", help="Export in 8 bits as well.")] = False,
     smoke: Annotated[bool, typer.Option("--smoke", help="A few steps, export and check only.")] = False,
 ) -> None:
@@ -101,7 +105,7 @@ def train_detector(
     with wanted_extra("train"):
         from tools.train.detector.training import command, settings_of
     with plain_errors():
-        settings = settings_of(width, steps, minutes, seed, threads)
+        settings = settings_of(width, steps, minutes, seed, threads, workers)
         command(out, settings, data, begin_from, smoke, int8, classes or ())
 
 

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Iterator
+from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,10 +18,11 @@ from procs.detector.yolo import Detector
 from tools.cli import app
 from tools.errors import UNUSABLE, UnusableError
 from tools.render import render_dataset
-from tools.train.detector.export import check_export, export, load_weights, quantise
+from tools.train.detector.export import check_export, export, load_weights
 from tools.train.detector.loss import assign, detection_loss, pair_iou
 from tools.train.detector.model import Sizes, WhaleDetector, cell_centres, decode
 from tools.train.detector.pictures import Mixture
+from tools.train.detector.quantise import _check, quantise
 from tools.train.detector.training import Settings, averaged, settings_of, train
 
 torch.set_num_threads(1)  # on a busy machine two wait for each other
@@ -128,6 +130,20 @@ def test_a_killed_run_goes_on_and_ends_like_one_that_was_not_killed(trained: Pat
         check_export(WhaleDetector(), resumed, 64)
 
 
+def test_the_settings_are_the_usual_ones_but_for_what_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("os.cpu_count", lambda: 16)
+    for cuda, asked, workers in ((False, None, 1), (True, None, 15), (True, 3, 3), (False, 0, 0)):
+        monkeypatch.setattr("torch.cuda.is_available", lambda cuda=cuda: cuda)
+        expected = Settings(Mixture(seed=3), steps=7, width=0.5, workers=workers)
+        assert settings_of(0.5, 7, None, 3, workers=asked) == expected
+
+
+def test_pictures_made_by_other_processes_are_the_same(trained: Path, tmp_path: Path) -> None:
+    (tmp_path / "detector_scenes").symlink_to(trained.parents[1] / "detector_scenes")
+    model = train(tmp_path / "run", replace(TINY, workers=1))
+    assert model.read_bytes() == trained.read_bytes()
+
+
 def test_a_run_by_the_clock_ends_when_its_time_is_over(trained: Path, tmp_path: Path) -> None:
     (tmp_path / "detector_scenes").symlink_to(trained.parents[1] / "detector_scenes")
     model = train(tmp_path / "run", replace(TINY, minutes=0.0005))
@@ -190,12 +206,14 @@ def test_half_the_width_is_a_network_of_its_own(tmp_path: Path) -> None:
     assert Sizes().scaled(0.01).stem == 8
     with pytest.raises(ValueError, match=r"width 9.*between 0\.25 and 2"):
         settings_of(9, None, None, 0)
-    assert settings_of(0.5, 7, None, 3) == Settings(Mixture(seed=3), steps=7, width=0.5)
 
 
 def test_eight_bits_keep_boxes_and_scores(trained: Path, tmp_path: Path) -> None:
     cache = trained.parents[1] / "detector_scenes"
-    small = quantise(trained, tmp_path / "int8.onnx", PICTURES, cache, count=8)
+    small = tmp_path / "int8.onnx"
+    told = quantise(trained, small, PICTURES, cache, count=8)
+    assert re.fullmatch(rf"{small}: scores 0\.0\d+ from float and boxes at an IoU of 0\.9\d+ .* MB", told)
+    assert list(tmp_path.iterdir()) == [small]
     assert small.stat().st_size < 0.5 * trained.stat().st_size
     picture = np.random.default_rng(0).integers(0, 255, (64, 64, 3), dtype=np.uint8)
     whole, rounded = (Detector(path, confidence=0.0, iou=1.0) for path in (trained, small))
@@ -204,6 +222,42 @@ def test_eight_bits_keep_boxes_and_scores(trained: Path, tmp_path: Path) -> None
     assert len(first) == len(second)
     # In 8 bits throughout, scores of a hundredth beside boxes of 64 px would all be one number.
     assert second.scores.std() > 0.2 * first.scores.std() > 0
+
+
+def test_an_export_in_8_bits_that_is_none_leaves_the_last_one_in_its_place(
+    trained: Path, tmp_path: Path
+) -> None:
+    cache, last = trained.parents[1] / "detector_scenes", tmp_path / "int8.onnx"
+    last.write_bytes(b"the last one")
+    foreign = onnx.load(str(trained))
+    for node in foreign.graph.node:
+        node.input[:] = [name.replace("heads.2.1", "tails.2.1") for name in node.input]
+    for item in foreign.graph.initializer:
+        item.name = item.name.replace("heads.2.1", "tails.2.1")
+    onnx.save(foreign, str(tmp_path / "foreign.onnx"))
+    with pytest.raises(UnusableError, match=r"foreign\.onnx: has the last convolutions of 3 heads, not of 4"):
+        quantise(tmp_path / "foreign.onnx", last, PICTURES, cache, count=8)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("tools.train.detector.quantise.LEAST_IOU", 1.1)
+        with pytest.raises(UnusableError, match=r"detector\.onnx in 8 bits has scores .* fly with the float"):
+            quantise(trained, last, PICTURES, cache, count=8)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["foreign.onnx", "int8.onnx"]
+    assert last.read_bytes() == b"the last one"
+
+
+def test_scores_and_boxes_that_differ_from_those_in_float_are_found_out(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    network = WhaleDetector(sizes=Sizes().scaled(0.25))
+    whole = export(network, tmp_path / "whole.onnx", 64)
+    images = [np.random.default_rng(0).random((1, 3, 64, 64), np.float32)]
+    assert _check(whole, whole, images).startswith("scores 0.000 from float and boxes at an IoU of 1.000")
+    for rows, message in ((slice(4, 5), r"scores 0\.[1-9]"), (slice(0, 4), r"at an IoU of 0\.[0-8]")):
+        other = deepcopy(network)
+        with torch.no_grad():
+            for head in other.heads:
+                head.get_parameter("1.bias")[rows] += 3
+        with pytest.raises(UnusableError, match=rf"whole\.onnx in 8 bits has .*{message}"):
+            _check(whole, export(other, tmp_path / "other.onnx", 64), images)
 
 
 def test_what_is_given_is_read_before_minutes_are_spent_on_rendering(

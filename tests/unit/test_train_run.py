@@ -162,3 +162,24 @@ def test_the_log_of_a_killed_run_ends_at_its_checkpoint_and_names_its_columns(
         with pytest.raises(KeyboardInterrupt):
             train(tmp_path, settings)
         assert log.read_text().splitlines() == [LOG_COLUMNS, *kept]
+
+
+def test_a_loss_that_is_no_number_is_told_with_a_remedy_that_works(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    none, number, batch = (
+        torch.tensor(torch.nan),
+        torch.tensor(1.0),
+        torch.zeros(2, 64, 64, 3, dtype=torch.uint8),
+    )
+    monkeypatch.setattr(training, "detection_loss", lambda *_: (none, number))
+    monkeypatch.setattr(training, "_from", lambda *_: iter([(batch, [torch.zeros(0, 5)] * 2)]))
+    monkeypatch.setattr(
+        training, "Batches", lambda *_: SimpleNamespace(rendered=[], empty=[], photographs=[])
+    )
+    left(tmp_path, 2, Given())
+    with pytest.raises(UnusableError, match=r"the loss is nan at step 2.*another --seed, which goes on"):
+        train(tmp_path, TINY)
+    monkeypatch.setattr(training, "detection_loss", lambda *_: (number.clone().requires_grad_(), number))
+    train(tmp_path, replace(TINY, pictures=replace(PICTURES, seed=1)), stop_after=3)
+    assert torch.load(tmp_path / "checkpoint.pt", weights_only=True)["step"] == 3

@@ -1,5 +1,5 @@
-"""Writes the trained network as ONNX in the Ultralytics layout, in float or in 8 bits, reads such files back,
-and checks that onnxruntime agrees with torch.
+"""Writes the trained network as ONNX in the Ultralytics layout, reads such files back, and checks that
+onnxruntime agrees with torch.
 """
 
 import re
@@ -9,16 +9,12 @@ from pathlib import Path
 import numpy as np
 import onnx
 import torch
-from numpy.typing import NDArray
-from onnxruntime.quantization import CalibrationDataReader, QuantFormat, QuantType, quantize_static
-from onnxruntime.quantization.shape_inference import quant_pre_process
 
 from procs.detector.yolo import open_session
 from tools.errors import UnusableError
 from tools.train.detector.model import STRIDES, Exported, WhaleDetector
-from tools.train.detector.pictures import Batches, Mixture
 
-__all__ = ["check_export", "export", "load_weights", "quantise"]
+__all__ = ["check_export", "describe", "export", "load_weights"]
 
 OPSET = 17
 NAMES = {0: "whale"}
@@ -45,7 +41,7 @@ def export(network: WhaleDetector, path: Path, side: int) -> Path:
             dynamo=False,
         )
     model = onnx.load(str(part))
-    _describe(model, side)
+    describe(model, side)
     onnx.checker.check_model(model)
     onnx.save(model, str(part))
     part.replace(path)
@@ -85,69 +81,7 @@ def load_weights(network: WhaleDetector, path: Path) -> None:
         ) from error
 
 
-def quantise(model: Path, out: Path, pictures: Mixture, cache: Path, count: int = 128) -> Path:
-    """Write `model` in 8-bit integers to `out`: what follows the heads' last convolutions stays in float.
-
-    Boxes and scores share one tensor; in 8 bits one scale for both would leave nothing of the scores. The
-    ranges are those seen on `count` training pictures.
-    """
-    whole, part = out.with_suffix(".folded.onnx"), out.with_suffix(".part.onnx")
-    quant_pre_process(str(model), str(whole), skip_symbolic_shape=True)
-    folded = onnx.load(str(whole))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        quantize_static(
-            str(whole),
-            str(part),
-            _TrainingPictures(pictures, cache, count),
-            quant_format=QuantFormat.QDQ,
-            activation_type=QuantType.QUInt8,
-            weight_type=QuantType.QInt8,
-            per_channel=True,
-            nodes_to_exclude=_last_nodes(folded.graph),
-        )
-    whole.unlink()
-    finished = onnx.load(str(part))
-    _describe(finished, pictures.side)
-    onnx.save(finished, str(out))
-    part.unlink()
-    return out
-
-
-class _TrainingPictures(CalibrationDataReader):  # type: ignore[misc]
-    """Training pictures for the ranges of a quantised network's values."""
-
-    def __init__(self, pictures: Mixture, cache: Path, count: int) -> None:
-        batches = Batches(pictures, cache, steps=max(count // pictures.batch, 1))
-        self._images = (
-            image.permute(2, 0, 1)[None].float().div(255).numpy()
-            for index in range(len(batches))
-            for image in batches[index][0]
-        )
-
-    def get_next(self) -> dict[str, NDArray[np.float32]] | None:
-        image = next(self._images, None)
-        return None if image is None else {"images": image}
-
-
-def _last_nodes(graph: onnx.GraphProto) -> list[str]:
-    """Names of the heads' last convolutions and of all nodes after them."""
-    reached = {node.output[0] for node in graph.node if _is_last_convolution(node)}
-    names = [node.name for node in graph.node if _is_last_convolution(node)]
-    for node in graph.node:  # in the order of computation
-        if any(name in reached for name in node.input):
-            names.append(node.name)
-            reached.update(node.output)
-    return names
-
-
-def _is_last_convolution(node: onnx.NodeProto) -> bool:
-    return node.op_type == "Conv" and any(
-        re.fullmatch(r"network\.heads\.\d\.1\.weight", n) for n in node.input
-    )
-
-
-def _describe(model: onnx.ModelProto, side: int) -> None:
+def describe(model: onnx.ModelProto, side: int) -> None:
     """Put the metadata that Ultralytics puts into its exports."""
     metadata = {
         "description": "podwatch whale detector",

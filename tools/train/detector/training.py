@@ -11,6 +11,7 @@ number of steps it ends as it would have without the kill. Needs the `train` ext
 device is used where there is one.
 """
 
+import os
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -23,11 +24,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tools.errors import UnusableError
-from tools.train.detector.export import check_export, export, quantise
+from tools.train.detector.export import check_export, export
 from tools.train.detector.loss import detection_loss
 from tools.train.detector.model import cell_centres, decode
 from tools.train.detector.own import own_pictures
 from tools.train.detector.pictures import Batches, Mixture
+from tools.train.detector.quantise import quantise
 from tools.train.detector.run import Given, Run, Settings, averaged
 
 __all__ = ["Settings", "averaged", "command", "settings_of", "train"]
@@ -135,8 +137,10 @@ def _step(run: Run, settings: Settings, images: Tensor, boxes: list[Tensor]) -> 
     score_loss, box_loss = detection_loss(logits, decoded, centres, strides, known)
     loss = score_loss + box_loss
     if not torch.isfinite(loss):
-        raise FloatingPointError(
-            f"the loss is {loss.item()} at step {run.step}: lower Settings.rate ({settings.rate})"
+        raise UnusableError(
+            f"the loss is {loss.item()} at step {run.step}: the training has come apart; give the same "
+            "command with another --seed, which goes on from the last checkpoint with other pictures; where "
+            "that comes apart too, choose another --out as well"
         )
     run.optimiser.zero_grad(set_to_none=True)
     loss.backward()  # type: ignore[no-untyped-call]
@@ -175,12 +179,23 @@ def _cut_log(log: Path, step: int) -> None:
 
 
 def settings_of(
-    width: float, steps: int | None, minutes: float | None, seed: int, threads: int = 1
+    width: float,
+    steps: int | None,
+    minutes: float | None,
+    seed: int,
+    threads: int = 1,
+    workers: int | None = None,
 ) -> Settings:
-    """The usual settings but for what the command line names. Raises UnusableError for a width of no use."""
+    """The usual settings but for what the command line names. Raises UnusableError for a width of no use.
+
+    workers: None for one beside a processor, which it keeps busy, and all but one processor beside CUDA.
+    """
     if not 0.25 <= width <= 2.0:
         raise UnusableError(f"width {width}: must lie between 0.25 and 2; 1 is the network that ships")
-    chosen = Settings(pictures=Mixture(seed=seed), width=width, minutes=minutes, threads=threads)
+    if workers is None:
+        workers = max((os.cpu_count() or 1) - 1, 1) if torch.cuda.is_available() else 1
+    pictures = Mixture(seed=seed)
+    chosen = Settings(pictures, width=width, minutes=minutes, threads=threads, workers=workers)
     return chosen if steps is None else replace(chosen, steps=steps)
 
 
