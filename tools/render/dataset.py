@@ -64,7 +64,7 @@ def corners_inside(corners: NDArray[np.float32], side: tuple[int, int]) -> NDArr
 
     Ultralytics refuses a picture with a corner outside it, and takes the smallest turned box round the four.
     So of the part inside, which has up to eight corners, those four stay that span most of it: the box round
-    them is the one given. Moved to the rim one by one, the corners would leave out more of what shows there.
+    them is the one given, or close to it. Moved to the rim one by one, the corners would leave out more.
     """
     if np.all((corners >= 0) & (corners <= side)):
         return corners
