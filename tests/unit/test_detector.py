@@ -17,6 +17,7 @@ from onnx import TensorProto, helper, numpy_helper
 
 import models
 from procs.detector.decode import Candidates, Layout, layout_of, suppress
+from procs.detector.network import open_session
 from procs.detector.yolo import Detector, ModelError
 from tests.unit.detector_networks import NAMES, PICTURE, network, raw
 
@@ -237,9 +238,14 @@ def test_the_shipped_model_is_small_and_says_what_it_is() -> None:
     assert metadata["license"] == "Apache-2.0"
 
 
-def test_the_model_card_is_about_the_file_that_ships() -> None:
-    digest = hashlib.sha256(models.path("detector.onnx").read_bytes()).hexdigest()
-    assert digest in models.path("detector.md").read_text()
+def test_the_model_card_is_about_the_files_that_ship() -> None:
+    card = models.path("detector.md").read_text()
+    for name in ("detector.onnx", "detector_half.onnx", "detector_int8.onnx"):
+        data = models.path(name).read_bytes()
+        said = f"`{name}`, {len(data) / 1e6:.2f} MB, sha256 `{hashlib.sha256(data).hexdigest()}`"
+        assert said in card
+    (output,) = open_session(models.path("detector.onnx")).get_outputs()
+    assert f"`output0` {tuple(output.shape)}" in card
 
 
 def test_the_library_under_it_keeps_and_sends_no_word_of_the_drone(tmp_path: Path) -> None:

@@ -27,11 +27,10 @@ QUICK_CASES = 200  # a size
 PRINTED = (FIVE, EXACT, LOSSY, HONEST, LARGER, LOSS, FLIGHT, TIME, RULE)
 
 
-def command(seed: int, cases: int, out: Path, *, quick: bool, draw_into: Path | None = None) -> None:
+def command(seed: int, cases: int, out: Path, *, quick: bool) -> None:
     """Measure all, then print one table a part, write bench_assignment.json and the figures.
 
-    cases: of each size up to 12 agents. quick: few cases a size, for a look and for tests. draw_into: folder
-    of the figures, `out` where None.
+    cases: of each size up to 12 agents. quick: few cases a size, for a look and for tests.
     """
     console = bench_console()
     count = min(cases, QUICK_CASES) if quick else cases
@@ -58,5 +57,5 @@ def command(seed: int, cases: int, out: Path, *, quick: bool, draw_into: Path | 
         print_table(f"podwatch bench assignment: {name}", taken[name], console)
         rows += taken[name]
     write_table(out / "bench_assignment.json", rows)
-    for path in draw(rings.points, draw_into or out):
+    for path in draw(rings.points, out):
         console.print(f"Figure: {path}", highlight=False)
