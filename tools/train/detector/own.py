@@ -1,7 +1,7 @@
 """Your own pictures: a YOLO data set in any of the shapes in which people have them."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -9,26 +9,61 @@ import yaml
 
 from tools.errors import UnusableError
 from tools.train.detector.labels import text_of
+from tools.train.detector.reduction import useful
 from tools.train.detector.samples import Sample, read_yolo
 
-__all__ = ["own_pictures"]
+__all__ = ["learnt_as_well", "own_pictures", "validation_pictures"]
 
 PICTURES = (".jpg", ".jpeg", ".png", ".bmp", ".webp", ".tif", ".tiff")
 
 
-def own_pictures(data_yaml: Path, classes: Sequence[str] = (), part: str = "train") -> list[Sample]:
-    """The pictures that `part` of a YOLO data.yaml names, whose labels lie in labels/ beside images/.
+def own_pictures(data_yaml: Path, classes: Sequence[str] = (), side: int = 320) -> list[Sample]:
+    """The pictures that `train` of a YOLO data.yaml names, as far as pictures of `side` px can show them.
 
-    The entry is a folder, searched with all below it, a text file that lists pictures, or a list of either.
-    classes: names or numbers of those that count as whales; needed where the data set has several, what is
-    of another class is then water. Raises UnusableError naming what is wrong.
+    The entry is a folder, searched with all below it, a text file that lists pictures, or a list of either;
+    labels lie in labels/ beside images/. classes: names or numbers of those that count as whales; needed
+    where the data set has several, what is of another class is then water. Raises UnusableError naming what
+    is wrong.
     """
+    samples: list[Sample] = []
+    count = 0
+    for picture in _pictures(data_yaml, classes, "train"):
+        samples += useful(picture, side)
+        count += 1
+    if len(samples) > count:
+        print(f"{data_yaml}: {count} pictures kept as {len(samples)}, the large ones cut round their animals")
+    return samples
+
+
+def validation_pictures(data_yaml: Path, classes: Sequence[str] = ()) -> Iterator[Sample]:
+    """The same of its entry `val`, one by one and as they are; none where nothing lies there."""
+    return _pictures(data_yaml, classes, "val", optional=True)
+
+
+def learnt_as_well(data_yaml: Path, classes: Sequence[str] = ()) -> int:
+    """How many of the pictures of `val` are pictures of `train` too."""
+    learnt, kept_back = (_files(data_yaml, classes, part, optional=True)[0] for part in ("train", "val"))
+    return sum(path in learnt for path in kept_back)
+
+
+def _pictures(data_yaml: Path, classes: Sequence[str], part: str, optional: bool = False) -> Iterator[Sample]:
+    files, counted = _files(data_yaml, classes, part, optional)
+    for path, labels in files.items():
+        yield from read_yolo([path], labels, counted)
+
+
+def _files(
+    data_yaml: Path, classes: Sequence[str], part: str, optional: bool
+) -> tuple[dict[Path, Path], dict[int, bool]]:
+    """Of each picture of an entry the folder of its labels, and of each class whether it counts."""
     if not data_yaml.is_file():
         raise UnusableError(f"{data_yaml}: no such file; give the data.yaml of a YOLO data set")
     try:
         entries = _read(data_yaml)
         counted = _counted(entries, classes)
         if not entries.get(part):
+            if optional:
+                return {}, counted
             raise ValueError(f"has no entry {part!r}; it must name the folder of its pictures")
     except ValueError as error:
         raise UnusableError(f"{data_yaml}: {error}") from None
@@ -36,6 +71,8 @@ def own_pictures(data_yaml: Path, classes: Sequence[str] = (), part: str = "trai
     named = [str(name) for name in (entries[part] if isinstance(entries[part], list) else [entries[part]])]
     found = list(dict.fromkeys(path for name in named for path in _listed(_place(root, name), root)))
     if not found:
+        if optional:  # Roboflow names folders that it leaves out
+            return {}, counted
         raise UnusableError(f"{data_yaml}: no pictures ({', '.join(PICTURES)}) in {_place(root, named[0])}")
     folders = {folder: _labels_beside(folder) for folder in sorted({path.parent for path in found})}
     if not any((folders[path.parent] / f"{path.stem}.txt").is_file() for path in found):
@@ -43,10 +80,8 @@ def own_pictures(data_yaml: Path, classes: Sequence[str] = (), part: str = "trai
             f"{data_yaml}: none of its {len(found)} pictures has a label file in {folders[found[0].parent]}; "
             "one without animals has an empty one"
         )
-    samples: list[Sample] = []
-    for folder, labels in folders.items():
-        samples += read_yolo([path for path in found if path.parent == folder], labels, counted)
-    return samples
+    in_folders = sorted(found, key=lambda path: path.parent)
+    return {path: folders[path.parent] for path in in_folders}, counted
 
 
 def _read(data_yaml: Path) -> dict[str, Any]:

@@ -11,7 +11,10 @@ from numpy.typing import NDArray
 from drivers.sim.render import Image
 from tools.train.detector.samples import Sample, clipped, place, reduced, row, scene_sample, turned
 
-__all__ = ["empty_seas", "photograph_sample"]
+__all__ = ["LONGEST_PX", "SHORTEST_PX", "USUAL_LENGTH_PX", "empty_seas", "photograph_sample"]
+
+USUAL_LENGTH_PX = 120.0  # of the animals that an empty window does not show
+SHORTEST_PX, LONGEST_PX = 20, 250  # of an animal in a picture of 320 px
 
 
 def _window(
@@ -24,12 +27,12 @@ def _window(
     """
     width, height = size
     longest = _longest_side(photo)
-    needed = max(max(width, height) / min(photo.image.shape[:2]), (animal_px or 120.0) / longest)
+    needed = max(max(width, height) / min(photo.image.shape[:2]), (animal_px or USUAL_LENGTH_PX) / longest)
     photo = turned(reduced(photo, needed), rng)
     source_height, source_width = photo.image.shape[:2]
     fill = max(width / source_width, height / source_height)
     box = photo.boxes[0] if len(photo.boxes) else None
-    scale = max(fill, (animal_px or 120.0) / _longest_side(photo))
+    scale = max(fill, (animal_px or USUAL_LENGTH_PX) / _longest_side(photo))
     room = np.array([width - scale * source_width, height - scale * source_height])  # at most 0
     shift = rng.uniform(0, 1, 2) * room
     if box is not None:
@@ -81,7 +84,7 @@ def _longest_side(photo: Sample) -> float:
 
 
 def _length_px(rng: np.random.Generator, side: int) -> float:
-    return float(np.exp(rng.uniform(np.log(20), np.log(250)))) * side / 320
+    return float(np.exp(rng.uniform(np.log(SHORTEST_PX), np.log(LONGEST_PX)))) * side / 320
 
 
 def _mosaic(photos: Sequence[Sample], rng: np.random.Generator, side: int) -> Sample:

@@ -46,6 +46,7 @@ __all__ = [
     "row",
     "scene_sample",
     "turned",
+    "with_halves",
 ]
 
 Boxes = NDArray[np.float32]
@@ -145,15 +146,16 @@ def read_yolo(
                 f"{path}: {width}x{height} px; a picture needs {LEAST_PICTURE_PX} px a side; remove it"
             )
         boxes = read_labels(labels / f"{path.stem}.txt", (width, height), counted)
-        samples.append(_with_halves(np.asarray(image, np.uint8), boxes, path.stem))
+        samples.append(with_halves(np.asarray(image, np.uint8), boxes, path.stem))
     return samples
 
 
-def _with_halves(image: Image, boxes: Boxes, name: str, levels: int = 4) -> Sample:
+def with_halves(image: Image, boxes: Boxes, name: str, levels: int = 4) -> Sample:
+    """A sample with what it looks like at half its size, and at half of that, `levels` times."""
     if levels == 0 or min(image.shape[:2]) < 4:
         return Sample(image, boxes, name=name)
     half = np.asarray(cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), np.uint8)
-    halved = _with_halves(half, boxes * row([0.5, 0.5, 0.5, 0.5, 1]), name, levels - 1)
+    halved = with_halves(half, boxes * row([0.5, 0.5, 0.5, 0.5, 1]), name, levels - 1)
     return Sample(image, boxes, halved, name)
 
 
