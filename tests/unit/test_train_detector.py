@@ -297,6 +297,7 @@ def test_the_smoke_run_of_the_command_line_leaves_a_model_that_loads(tmp_path: P
     assert result.exit_code == 0, result.output
     assert re.search(r"2 pictures of your own with [1-9]\d* animals", result.output)
     assert "at most" in result.output, "the export was held against torch"
+    assert re.search(r"n = 2 pictures \(2 learnt as well\) with [1-9]\d* animals .*recall", result.output)
     model = Detector(tmp_path / "run" / "smoke" / "detector.onnx")
     assert model.input_size == (320, 320)
     assert model.detect(np.zeros((480, 640, 3), np.uint8)).boxes.shape[1] == 4

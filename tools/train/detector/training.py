@@ -31,6 +31,7 @@ from tools.train.detector.own import own_pictures
 from tools.train.detector.pictures import Batches, Mixture
 from tools.train.detector.quantise import quantise
 from tools.train.detector.run import Given, Run, Settings, averaged
+from tools.train.detector.validation import count_validation, measure
 
 __all__ = ["Settings", "averaged", "command", "settings_of", "train"]
 
@@ -62,7 +63,7 @@ def train(
         )
         return export(averaged(out), out / "detector.onnx", settings.pictures.side)
     # What was given is read before minutes are spent on rendering.
-    own = own_pictures(data, classes) if data is not None else []
+    own = own_pictures(data, classes, settings.pictures.side) if data is not None else []
     out.mkdir(parents=True, exist_ok=True)
     batches = Batches(settings.pictures, out.parent / "detector_scenes", own)
     print(
@@ -226,8 +227,11 @@ def command(
             workers=0,
         )
     begun = time.monotonic()
+    kept_back = count_validation(data, classes) if data is not None else 0
     model = train(out, settings, data, begin_from, classes=classes)
     print(f"{model}: {check_export(averaged(out), model, settings.pictures.side)}")
+    if data is not None and kept_back:
+        print(measure(model, data, classes))
     if int8:
         cache = out.parent / "detector_scenes"
         print(quantise(model, model.with_name("detector_int8.onnx"), settings.pictures, cache))
