@@ -94,7 +94,8 @@ def _begun(checkpoint: Path, settings: Settings, given: Given) -> Run:
     run = Run(settings)
     if checkpoint.is_file():
         run.load(checkpoint, settings, given)
-        print(f"goes on at step {run.step}, {run.progress(settings):.0%} of the training", flush=True)
+        if run.progress(settings) < 1:
+            print(f"goes on at step {run.step}, {run.progress(settings):.0%} of the training", flush=True)
     elif given.begin_from is not None:
         run.begin_from(given.begin_from, settings.rate_from)
         print(f"begins from {given.begin_from}", flush=True)
