@@ -231,9 +231,9 @@ def test_an_export_in_8_bits_that_is_none_leaves_the_last_one_in_its_place(
     last.write_bytes(b"the last one")
     foreign = onnx.load(str(trained))
     for node in foreign.graph.node:
-        node.input[:] = [name.replace("heads.2.1", "tails.2.1") for name in node.input]
+        node.input[:] = [name.replace("network.heads.2.1.", "network.tails.2.1.") for name in node.input]
     for item in foreign.graph.initializer:
-        item.name = item.name.replace("heads.2.1", "tails.2.1")
+        item.name = item.name.replace("network.heads.2.1.", "network.tails.2.1.")
     onnx.save(foreign, str(tmp_path / "foreign.onnx"))
     with pytest.raises(UnusableError, match=r"foreign\.onnx: has the last convolutions of 3 heads, not of 4"):
         quantise(tmp_path / "foreign.onnx", last, PICTURES, cache, count=8)
