@@ -48,12 +48,19 @@ def views(
         list[Path], typer.Argument(help="Pictures or videos of one scene from several viewpoints.")
     ],
     out: Annotated[Path, typer.Option(help="The figure to write.")] = Path("views.png"),
+    confidence: Annotated[
+        float,
+        typer.Option(min=0.01, max=1, help="Least score of a find: lower finds more, and more wrongly."),
+    ] = 0.25,
+    model: Annotated[
+        Path | None, typer.Option(help="An ONNX file of your own in place of the one that ships.")
+    ] = None,
 ) -> None:
     """Detect, register round the ring and assign, on pictures that stand for several drones' views."""
     from tools.views import command
 
     with plain_errors():
-        command(pictures, out)
+        command(pictures, out, confidence, model)
 
 
 @app.command("render")

@@ -72,8 +72,8 @@ def command(pictures: Sequence[Path], out: Path, confidence: float = 0.25, model
         typer.echo(f"{path.name}: {len(found)} animal{'' if len(found) == 1 else 's'}")
     if not any(len(found) for found in boxes):
         typer.echo(
-            f"podwatch: no animal found in any of {len(images)} pictures at confidence {confidence}; "
-            "try a lower one, or pictures from nearer",
+            f"podwatch: no animal found in any of {len(images)} pictures at confidence {confidence:g}; "
+            "try a lower --confidence, pictures from nearer, or a --model of your own",
             err=True,
         )
         raise typer.Exit(FAILED)

@@ -13,10 +13,12 @@ import pytest
 import typer
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from numpy.typing import NDArray
+from typer.testing import CliRunner
 
 from drivers.cameras.pinhole import Pinhole, Pose
 from drivers.sim.render.renderer import SeaRenderer
 from drivers.sim.render.scene import AnimalView
+from tools.cli import app
 from tools.views import Agreement, ViewsError, _told, agree, command, common_frame, draw, read_pictures
 
 DATA = Path(os.environ.get("PODWATCH_REAL_DATA", Path(__file__).parents[3] / "shared" / "data"))
@@ -170,6 +172,28 @@ def test_pictures_without_animals_are_exit_code_1(tmp_path: Path, capsys: pytest
     assert ended.value.exit_code == 1
     assert "no animal found in any of 2 pictures" in capsys.readouterr().err
     assert not (tmp_path / "out.png").exists()
+
+
+def test_the_remedies_that_are_named_are_options_of_the_command_line(tmp_path: Path) -> None:
+    paths = [tmp_path / "a.png", tmp_path / "b.png"]
+    for path in paths:
+        cv2.imwrite(str(path), np.full((240, 320, 3), (128, 82, 22), np.uint8))
+    given = ["views", *map(str, paths), "--out", str(tmp_path / "out.png")]
+    said = CliRunner().invoke(app, [*given, "--confidence", "0.07"])
+    assert said.exit_code == 1
+    assert "no animal found in any of 2 pictures at confidence 0.07; try a lower --confidence" in said.stderr
+    assert "--model" in said.stderr
+    said = CliRunner().invoke(app, [*given, "--model", str(tmp_path / "mine.onnx")])
+    assert said.exit_code == 3
+    assert "mine.onnx" in said.stderr
+    assert CliRunner().invoke(app, [*given, "--confidence", "7"]).exit_code == 2
+
+
+def test_a_confidence_above_every_find_finds_nothing(tmp_path: Path) -> None:
+    given = ["views", *map(str, rendered(tmp_path)), "--out", str(tmp_path / "out.png")]
+    said = CliRunner().invoke(app, [*given, "--confidence", "1"])
+    assert said.exit_code == 1
+    assert "view_1.png: 0 animals" in said.stdout
 
 
 def boxes_round(centres: Array) -> Array:
