@@ -1,7 +1,10 @@
 """The fleet file: what `podwatch fleet` writes, what a drone is told from it, and what it still lacks."""
 
+import os
+import shutil
 import socket
 import stat
+import tempfile
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -21,6 +24,8 @@ from tools.findings import Finding
 from tools.fleet import check
 from tools.fleet.machine import boat_radio, drone_settings, machine_of, read_fleet
 from tools.sim.settings import SimMission
+
+NOBODY = 65534
 
 
 def podwatch(*arguments: object) -> Any:
@@ -105,9 +110,6 @@ def test_each_thing_that_lacks_is_named_with_what_mends_it(bench, tmp_path):
     key = tmp_path / "fleet.key"
     key.chmod(0o644)
     assert f"chmod 600 {key}" in lacking(bench)
-    key.unlink()
-    assert "podwatch fleet keys" in lacking(bench, "--drone", 1)
-    podwatch("keys", bench)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
         taken.bind(("127.0.0.1", 0))
         port = taken.getsockname()[1]
@@ -120,6 +122,57 @@ def test_each_thing_that_lacks_is_named_with_what_mends_it(bench, tmp_path):
     assert "width_px = 640, height_px = 480" in lacking(bench, "--drone", 1)
     bench.write_text(text.replace(machine_of(read_fleet(bench), 1).autopilot, "serial:/dev/ttyNONE7:57600"))
     assert "/dev/ttyNONE7 is not there" in lacking(bench, "--drone", 1)
+
+
+def test_a_key_that_a_drone_lacks_is_copied_and_never_made_anew(fleet):
+    key = fleet.parent / "fleet.key"
+    whole = key.read_text()
+    for broken in ("", "no key", whole[:40]):
+        key.write_text(broken)
+        said = lacking(fleet, "--drone", 1)
+        assert f"scp -p 10.76.0.100:FOLDER/fleet.key {fleet.parent}/" in said
+        assert "fleet keys" not in said, "another key shuts the drone out, and every check is well"
+        assert f"podwatch fleet keys --force {fleet} # only where no machine of the fleet has" in lacking(
+            fleet
+        )
+    key.unlink()
+    assert "scp -p 10.76.0.100:" in lacking(fleet, "--drone", 1)
+    assert f"podwatch fleet keys {fleet} # only where no machine of the fleet has" in lacking(fleet)
+    assert "else: scp -p MACHINE:FOLDER/fleet.key" in lacking(fleet)
+    assert podwatch("keys", fleet).exit_code == 0, "what was told"
+
+
+def test_two_keys_are_told_apart_without_a_word_of_either(fleet):
+    keys, fingerprints = [], []
+    for _ in range(2):
+        made = podwatch("keys", fleet, "--force").stdout
+        keys.append((fleet.parent / "fleet.key").read_text().strip())
+        fingerprints.append(made.partition("fingerprint ")[2][:8])
+        assert f"fingerprint {fingerprints[-1]}: the same on every machine" in podwatch("check", fleet).stdout
+        assert fingerprints[-1] not in keys[-1]
+    assert fingerprints[0] != fingerprints[1]
+
+
+def test_a_key_that_this_user_may_not_read_is_given_to_this_user():
+    folder = Path(tempfile.mkdtemp(dir="/tmp"))  # tmp_path is closed to others
+    path, key = folder / "fleet.toml", folder / "fleet.key"
+    try:
+        podwatch("new", path)
+        podwatch("keys", path)
+        key.chmod(0)
+        folder.chmod(0o755)
+        mission = read_fleet(path)
+        if is_root := os.geteuid() == 0:  # whom no mode stops
+            os.seteuid(NOBODY)
+        try:
+            found = {one.what: one for one in check.check_fleet(mission, path, on_drone=True)}["key"]
+        finally:
+            if is_root:
+                os.seteuid(0)
+        assert "Permission denied" in found.lacks
+        assert found.mend == f"sudo chown $USER {key} && chmod 600 {key}"
+    finally:
+        shutil.rmtree(folder)
 
 
 def test_members_that_share_an_address_or_have_none_are_named(fleet):

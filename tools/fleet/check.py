@@ -1,6 +1,8 @@
 """What a drone, or the fleet file itself, still lacks, each with the command or the line that mends it."""
 
+import hashlib
 import os
+import shlex
 import socket
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,14 +15,17 @@ from tools.doctor.machine import check_receive_buffer, check_route, check_shared
 from tools.findings import Finding
 from tools.fleet.machine import drone_settings, listen_address, machine_of
 
-__all__ = ["check_drone", "check_fleet"]
+__all__ = ["check_drone", "check_fleet", "fingerprint"]
 
 
-def check_fleet(mission: Mission, path: Path) -> list[Finding]:
-    """What every machine of the fleet needs: a mission, its key, and an address for each member."""
+def check_fleet(mission: Mission, path: Path, *, on_drone: bool = False) -> list[Finding]:
+    """What every machine of the fleet needs: a mission, its key, and an address for each member.
+
+    on_drone: this is a drone's machine, whose key was made elsewhere.
+    """
     return [
         Finding("mission", f"{mission.name}: drones {', '.join(map(str, mission.roster))}"),
-        _key(mission, path),
+        _key(mission, path, on_drone=on_drone),
         *_addresses(mission),
     ]
 
@@ -32,7 +37,7 @@ def check_drone(mission: Mission, path: Path, drone_id: int) -> list[Finding]:
         mission, drone_id, bus_url="", run="check", run_dir=Path(), log_path=Path("check.mcap")
     )
     return [
-        *check_fleet(mission, path),
+        *check_fleet(mission, path, on_drone=True),
         _model(settings.drivers["detector"]),
         _camera(mission, machine, settings.drivers["camera"]),
         _device("autopilot", machine.autopilot),
@@ -43,17 +48,42 @@ def check_drone(mission: Mission, path: Path, drone_id: int) -> list[Finding]:
     ]
 
 
-def _key(mission: Mission, path: Path) -> Finding:
+def fingerprint(key: bytes) -> str:
+    """8 digits by which two copies of a fleet key are told apart, and which tell nothing of it."""
+    return hashlib.sha256(b"podwatch fleet key" + key).hexdigest()[:8]
+
+
+def _key(mission: Mission, path: Path, *, on_drone: bool) -> Finding:
     key = Path(mission.radio.key_file)
     try:
-        read_key(key)
+        held = read_key(key)
     except FleetKeyError as error:
-        if not key.exists():
-            return Finding("key", lacks=f"{key} is not there", mend=f"podwatch fleet keys {path}")
-        mode = key.stat().st_mode & 0o777
-        mend = f"chmod 600 {key}" if mode & 0o077 else f"podwatch fleet keys --force {path}"
-        return Finding("key", lacks=str(error), mend=mend)
-    return Finding("key", f"{key}, readable by its owner alone")
+        is_missing = isinstance(error.__cause__, FileNotFoundError)
+        return Finding(
+            "key",
+            lacks=f"{key} is not there" if is_missing else str(error),
+            mend=_key_mend(mission, path, error, on_drone=on_drone),
+        )
+    return Finding("key", f"{key}, fingerprint {fingerprint(held)}: the same on every machine")
+
+
+def _key_mend(mission: Mission, path: Path, error: FleetKeyError, *, on_drone: bool) -> str:
+    """Where others may hold a key it is copied: one that is made anew shuts them out."""
+    key = Path(mission.radio.key_file)
+    place = shlex.quote(str(key))
+    if isinstance(error.__cause__, PermissionError):
+        return f"sudo chown $USER {place} && chmod 600 {place}"
+    if key.exists() and key.stat().st_mode & 0o077:
+        return f"chmod 600 {place}"
+    force = "--force " if key.exists() else ""
+    make = f"podwatch fleet keys {force}{shlex.quote(str(path))}"
+    if len(mission.roster) == 1 and not mission.boat.radio:
+        return make
+    source = (on_drone and mission.boat.radio.rpartition(":")[0]) or "MACHINE"
+    copy = f"scp -p {source}:FOLDER/{key.name} {shlex.quote(str(key.parent))}/"
+    if on_drone:
+        return f"{copy}  # the key that the others hold: one made here would shut this drone out"
+    return f"{make}  # only where no machine of the fleet has a good one; else: {copy}"
 
 
 def _addresses(mission: Mission) -> Iterator[Finding]:

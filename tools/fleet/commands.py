@@ -43,8 +43,9 @@ def keys(
     force: Annotated[bool, typer.Option("--force", help="Replace a key that is there.")] = False,
 ) -> None:
     """Make the fleet key, readable by its owner alone; copy it to every drone and the boat."""
-    from procs.relay.keys import make_key
+    from procs.relay.keys import make_key, read_key
     from procs.settings import MissionError
+    from tools.fleet.check import fingerprint
     from tools.fleet.machine import read_fleet
 
     with plain_errors():
@@ -55,7 +56,11 @@ def keys(
                 f"{key} exists: a new key shuts out every drone that holds the old; --force replaces it"
             )
         make_key(key, force)
-    typer.echo(f"{key}: made, mode 0600. Copy it to every machine of the fleet (scp -p), and to nobody else.")
+        made = fingerprint(read_key(key))
+    typer.echo(
+        f"{key}: made, mode 0600, fingerprint {made}. Copy it to every machine of the fleet (scp -p), and to "
+        "nobody else."
+    )
 
 
 @app.command("check")
