@@ -5,24 +5,23 @@ import shutil
 import socket
 import subprocess
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
-from pymavlink.dialects.v20 import common
 from typer.testing import CliRunner
 
-from tests.talker import saying_again
+from tests.talker import beat, saying_again, talking
 from tools import errors
 from tools.buses import N_SLOTS, bus_url, free_udp_ports
 from tools.cli import app
 from tools.doctor import machine
-from tools.doctor.drone import check_autopilot
 from tools.doctor.mend import as_root
 from tools.findings import Finding
+from tools.fleet.edges import check_autopilot
+from tools.fleet.machine import machine_of, read_fleet
 
 PODWATCH = f"{sys.executable} -c 'from tools.cli import main; main()'"
 NAMESPACES = ("unshare", "--map-root-user", "--mount", "--net")
@@ -174,7 +173,7 @@ def test_a_key_that_others_can_read_is_told(fleet):
 
 
 def test_a_camera_that_is_not_there_is_told(monkeypatch, fleet):
-    monkeypatch.setattr("tools.doctor.drone.LISTEN_S", 0.1)
+    monkeypatch.setattr("tools.fleet.check.LISTEN_S", 0.1)
     fleet.write_text(fleet.read_text().replace("v4l2:/dev/video0", "v4l2:/dev/video77"))
     code, said = doctor(fleet, "--drone", 1, "--only", "slots")
     assert code == 3
@@ -183,40 +182,66 @@ def test_a_camera_that_is_not_there_is_told(monkeypatch, fleet):
 
 
 def test_an_autopilots_port_that_is_taken_and_a_silent_one_are_told(monkeypatch, fleet):
-    monkeypatch.setattr("tools.doctor.drone.LISTEN_S", 0.1)
+    monkeypatch.setattr("tools.fleet.check.LISTEN_S", 0.1)
     [port] = free_udp_ports(1)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
         taken.bind(("127.0.0.1", port))
-        assert "does another program use it" in check_autopilot(f"udp:127.0.0.1:{port}", 0.05).lacks
-    silent = check_autopilot(f"udp:127.0.0.1:{port}", 0.05)
+        finding = check_autopilot(f"udp:127.0.0.1:{port}", 1, 0.05)
+    assert "does another program use it" in finding.lacks
+    assert f"ss -lunp sport = :{port}" in finding.mend
+    silent = check_autopilot(f"udp:127.0.0.1:{port}", 1, 0.05)
     assert "silent for 0.05 s" in silent.lacks
     assert silent.mend.startswith(f"mavproxy.py --out=udp:127.0.0.1:{port}")
-    assert "--baudrate=57600" in check_autopilot("serial:/dev/ttyNONE:57600", 0.05).mend
-    assert check_autopilot(f"tcp:127.0.0.1:{port}", 0.05).mend.startswith(f"nc -vz 127.0.0.1 {port}")
+    assert "/dev/ttyNONE is not there" in check_autopilot("serial:/dev/ttyNONE:57600", 1, 0.05).lacks
+    mute, far = os.openpty()
+    try:
+        silent = check_autopilot(f"serial:{os.ttyname(far)}:57600", 1, 0.05)
+        assert silent.mend.startswith(f"mavproxy.py --master={os.ttyname(far)} --baudrate=57600")
+    finally:
+        os.close(mute)
+        os.close(far)
+    assert check_autopilot(f"tcp:127.0.0.1:{port}", 1, 0.05).mend.startswith(f"nc -vz 127.0.0.1 {port}")
     code, said = doctor(fleet, "--drone", 1, "--only", "slots")
     assert code == 3
     assert "mavproxy.py --out=udp:127.0.0.1:" in said
 
 
-@contextmanager
-def talking(data: bytes, port: int) -> Iterator[None]:
-    """Somebody who says `data` to a port of this machine, again and again."""
-    with (
-        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out,
-        saying_again(lambda: out.sendto(data, ("127.0.0.1", port)), 0.01),
-    ):
-        yield
-
-
-def test_an_autopilot_that_beats_is_well_and_noise_is_not():
+def test_the_autopilot_of_the_drones_own_id_is_well_and_nothing_else_is():
     [port] = free_udp_ports(1)
-    dialect = common.MAVLink(None)
-    with talking(dialect.heartbeat_encode(2, 3, 0, 0, 3).pack(dialect), port):
-        assert check_autopilot(f"udp:127.0.0.1:{port}", 5.0) == Finding(
-            "autopilot", f"udp:127.0.0.1:{port} speaks MAVLink"
-        )
+    address = f"udp:127.0.0.1:{port}"
+    with talking(beat(7) + beat(2), port):
+        assert check_autopilot(address, 2, 5.0) == Finding("autopilot", f"{address}: system 2 speaks MAVLink")
+    with talking(beat(1), port):
+        other = check_autopilot(address, 2, 0.2)
+    assert "the autopilot of system 1 beats, only 2 would be heard" in other.lacks
+    assert "param set MAV_SYSID 2 (before ArduPilot 4.7: SYSID_THISMAV)" in other.mend
+    with talking(beat(2, 191), port):
+        assert "MAVLink, but no autopilot's heartbeat" in check_autopilot(address, 2, 0.2).lacks
     with talking(b"x" * 40, port):
-        assert "no MAVLink" in check_autopilot(f"udp:127.0.0.1:{port}", 5.0).lacks
+        assert "bytes that are no MAVLink" in check_autopilot(address, 2, 0.2).lacks
+
+
+def test_an_autopilot_that_waits_to_be_spoken_to_is_heard():
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as far:
+        far.bind(("127.0.0.1", 0))
+        far.setblocking(False)
+
+        def answer() -> None:
+            with suppress(BlockingIOError):
+                far.sendto(beat(2), far.recvfrom(100)[1])
+
+        with saying_again(answer, 0.01):
+            assert check_autopilot(f"udpout:127.0.0.1:{far.getsockname()[1]}", 2, 5.0).lacks == ""
+
+
+@pytest.mark.parametrize("command", ["doctor", "fleet check"])
+def test_both_commands_hear_that_an_autopilot_has_another_drones_id(monkeypatch, fleet, command):
+    monkeypatch.setattr("tools.fleet.check.LISTEN_S", 0.2)
+    address = machine_of(read_fleet(fleet), 1).autopilot
+    with talking(beat(3), int(address.rpartition(":")[2])):
+        result = CliRunner().invoke(app, [*command.split(), str(fleet), "--drone", "1"])
+    assert "the autopilot of system 3 beats, only 1 would be heard" in " ".join(result.output.split())
+    assert result.exit_code == errors.MISSING
 
 
 def test_without_java_the_command_that_installs_it_is_told(monkeypatch, tmp_path):
@@ -227,7 +252,7 @@ def test_without_java_the_command_that_installs_it_is_told(monkeypatch, tmp_path
 
 
 def test_a_drones_machine_needs_no_java(monkeypatch, fleet):
-    monkeypatch.setattr("tools.doctor.drone.LISTEN_S", 0.1)
+    monkeypatch.setattr("tools.fleet.check.LISTEN_S", 0.1)
     assert "java" not in doctor(fleet, "--drone", 1)[1]
 
 

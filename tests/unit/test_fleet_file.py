@@ -17,6 +17,7 @@ from typer.testing import CliRunner
 from procs.bus_executor import load_driver
 from procs.relay.keys import read_key
 from procs.settings import Mission, MissionError, load_mission
+from tests.talker import beat, talking
 from tools import errors
 from tools.buses import free_udp_ports
 from tools.cli import app
@@ -100,12 +101,15 @@ def test_the_key_is_its_owners_alone_and_replaced_only_by_force(fleet):
 
 
 def test_a_drone_on_a_machine_that_has_everything_lacks_nothing(bench):
-    result = podwatch("check", bench, "--drone", 2)
+    port = int(machine_of(read_fleet(bench), 2).autopilot.rpartition(":")[2])
+    with talking(beat(2), port):
+        result = podwatch("check", bench, "--drone", 2)
     assert result.exit_code == 0, result.output
     assert "lacks" not in result.output
 
 
-def test_each_thing_that_lacks_is_named_with_what_mends_it(bench, tmp_path):
+def test_each_thing_that_lacks_is_named_with_what_mends_it(bench, tmp_path, monkeypatch):
+    monkeypatch.setattr(check, "LISTEN_S", 0.05)
     text = bench.read_text()
     key = tmp_path / "fleet.key"
     key.chmod(0o644)
@@ -124,9 +128,10 @@ def test_each_thing_that_lacks_is_named_with_what_mends_it(bench, tmp_path):
     assert "/dev/ttyNONE7 is not there" in lacking(bench, "--drone", 1)
 
 
-def test_a_key_that_a_drone_lacks_is_copied_and_never_made_anew(fleet):
+def test_a_key_that_a_drone_lacks_is_copied_and_never_made_anew(monkeypatch, fleet):
     key = fleet.parent / "fleet.key"
     whole = key.read_text()
+    monkeypatch.setattr(check, "LISTEN_S", 0.05)
     for broken in ("", "no key", whole[:40]):
         key.write_text(broken)
         said = lacking(fleet, "--drone", 1)
@@ -173,6 +178,36 @@ def test_a_key_that_this_user_may_not_read_is_given_to_this_user():
         assert found.mend == f"sudo chown $USER {key} && chmod 600 {key}"
     finally:
         shutil.rmtree(folder)
+
+
+def test_a_radio_address_that_this_machine_does_not_have_is_named(monkeypatch, fleet):
+    monkeypatch.setattr(check, "LISTEN_S", 0.05)
+    fleet.write_text(fleet.read_text().replace("10.76.0.", "240.0.0."))  # reserved: nobody's
+    said = lacking(fleet, "--drone", 2)
+    assert "udp 240.0.0.2:14600: this machine has no address 240.0.0.2, where the others reach it" in said
+    assert "ip -br address" in said
+
+
+def test_the_boats_machine_is_looked_at_too(fleet):
+    [port] = free_udp_ports(1)
+    assert "this machine has no address 10.76.0.100" in lacking(fleet, "--boat")
+    fleet.write_text(fleet.read_text().replace("10.76.0.100:14600", f"127.0.0.1:{port}"))
+    assert f"udp 127.0.0.1:{port} is free" in podwatch("check", fleet, "--boat").stdout
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
+        taken.bind(("127.0.0.1", port))
+        assert f"ss -lunp sport = :{port}" in lacking(fleet, "--boat")
+    assert podwatch("check", fleet, "--boat", "--drone", 1).exit_code == errors.UNUSABLE
+    fleet.write_text(fleet.read_text().partition("[boat]")[0])
+    assert '[boat] radio = "HOST:PORT"' in lacking(fleet, "--boat")
+
+
+def test_a_pipeline_that_the_installed_opencv_cannot_open_is_told_as_that(monkeypatch, fleet):
+    monkeypatch.setattr(check, "LISTEN_S", 0.05)
+    assert not cv2.videoio_registry.hasBackend(cv2.CAP_GSTREAMER), "the wheels of PyPI are built without it"
+    fleet.write_text(fleet.read_text().replace("v4l2:/dev/video0", "gstreamer:videotestsrc ! appsink"))
+    said = lacking(fleet, "--drone", 1)
+    assert "gstreamer:videotestsrc ! appsink: the OpenCV that pip installs is built without GStreamer" in said
+    assert '"ffmpeg:ADDRESS"' in said
 
 
 def test_members_that_share_an_address_or_have_none_are_named(fleet):

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 __all__ = ["doctor"]
 
+OWN = ("multicast", "rmem_max", "/dev/shm")  # of the machine: looked at in any case
 CHECKS = ("multicast", "rmem_max", "slots", "shm", "model", "java")
 
 
@@ -80,7 +81,7 @@ def _look(
     """Each finding as soon as it is made."""
     from procs.settings import Mission
     from tools.doctor import machine
-    from tools.doctor.drone import fleet_findings
+    from tools.fleet.check import check_drone, check_fleet
 
     on_drone = drone_id is not None
     asked = mission or Mission()
@@ -97,7 +98,8 @@ def _look(
         if name != "model" or not on_drone:  # a drone's own machine may name another
             yield checks[name]()
     if mission is not None and path is not None:
-        yield from fleet_findings(mission, path, drone_id)
+        found = check_fleet(mission, path) if drone_id is None else check_drone(mission, path, drone_id)
+        yield from (one for one in found if one.what not in OWN)
 
 
 def _print(finding: "Finding", console: Console) -> None:

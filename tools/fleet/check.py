@@ -1,21 +1,22 @@
 """What a drone, or the fleet file itself, still lacks, each with the command or the line that mends it."""
 
 import hashlib
-import os
 import shlex
-import socket
 from collections.abc import Iterator
 from pathlib import Path
 
 from procs.bus_executor import load_driver
 from procs.relay.keys import FleetKeyError, read_key
 from procs.runtime import RuntimeFailure
-from procs.settings import DriverSpec, MachineSettings, Mission
+from procs.settings import DriverSpec, Mission
 from tools.doctor.machine import check_receive_buffer, check_route, check_shared_memory, frames_bytes
 from tools.findings import Finding
-from tools.fleet.machine import drone_settings, listen_address, machine_of
+from tools.fleet.edges import check_autopilot, check_camera, check_radio
+from tools.fleet.machine import AUTOPILOT_DRIVER, drone_settings, machine_of
 
-__all__ = ["check_drone", "check_fleet", "fingerprint"]
+__all__ = ["check_boat", "check_drone", "check_fleet", "fingerprint"]
+
+LISTEN_S = 3.0  # an autopilot beats once a second
 
 
 def check_fleet(mission: Mission, path: Path, *, on_drone: bool = False) -> list[Finding]:
@@ -39,13 +40,23 @@ def check_drone(mission: Mission, path: Path, drone_id: int) -> list[Finding]:
     return [
         *check_fleet(mission, path, on_drone=True),
         _model(settings.drivers["detector"]),
-        _camera(mission, machine, settings.drivers["camera"]),
-        _device("autopilot", machine.autopilot),
-        _port("radio", listen_address(machine.radio)),
+        check_camera(mission, machine, settings.drivers["camera"]),
+        _autopilot(settings.drivers["autopilot"], drone_id),
+        check_radio("radio", machine.radio),
         check_route(on_drone=True),
         check_receive_buffer(),
         check_shared_memory(frames_bytes(mission.camera, 1)),
     ]
+
+
+def check_boat(mission: Mission, path: Path) -> list[Finding]:
+    """What the boat needs on this machine."""
+    if not mission.boat.radio:
+        return [
+            *check_fleet(mission, path),
+            Finding("boat", lacks="the fleet file names none", mend='write: [boat] radio = "HOST:PORT"'),
+        ]
+    return [*check_fleet(mission, path), check_radio("radio", mission.boat.radio)]
 
 
 def fingerprint(key: bytes) -> str:
@@ -116,6 +127,13 @@ def _addresses(mission: Mission) -> Iterator[Finding]:
         )
 
 
+def _autopilot(spec: DriverSpec, drone_id: int) -> Finding:
+    """Listen, as the bridge would."""
+    if spec.driver != AUTOPILOT_DRIVER:
+        return Finding("autopilot", f"{spec.driver}: a driver of your own, not looked at")
+    return check_autopilot(spec.options["address"], spec.options.get("system_id") or drone_id, LISTEN_S)
+
+
 def _model(spec: DriverSpec) -> Finding:
     """Load it, as the detector will."""
     own = spec.options.get("model_path")
@@ -125,74 +143,3 @@ def _model(spec: DriverSpec) -> Finding:
         mend = "[detector] model = ...: another file" if own else "pip install --force-reinstall podwatch"
         return Finding("model", lacks=str(error), mend=mend)
     return Finding("model", str(own or "the detector that ships"))
-
-
-def _camera(mission: Mission, machine: MachineSettings, spec: DriverSpec) -> Finding:
-    """Open it and take a picture: its size is what the mission says."""
-    kind, _, source = machine.camera.partition(":")
-    is_device = kind == "v4l2" and "camera" not in machine.drivers
-    if is_device and (lacking := _lacking_device("camera", source, "video")):
-        return lacking
-    try:
-        image = load_driver(spec).capture()
-    except (RuntimeFailure, OSError) as error:
-        return Finding(
-            "camera", lacks=str(error), mend="v4l2-ctl --list-devices; then set camera in the file"
-        )
-    width, height = mission.camera.width_px, mission.camera.height_px
-    if image is None:
-        return Finding(
-            "camera",
-            lacks=f"{machine.camera} gives no picture",
-            mend="see that it is connected; dmesg | tail",
-        )
-    if image.shape[:2] != (height, width):
-        given = f"{image.shape[1]}x{image.shape[0]}"
-        return Finding(
-            "camera",
-            lacks=f"{machine.camera} gives {given}, the mission wants {width}x{height}",
-            mend=f"[camera] width_px = {image.shape[1]}, height_px = {image.shape[0]}",
-        )
-    return Finding("camera", f"{machine.camera} gives {width}x{height}")
-
-
-def _device(what: str, address: str) -> Finding:
-    """The autopilot's device, or its port where it is reached over a socket."""
-    kind, _, rest = address.partition(":")
-    if kind == "serial":
-        device = rest.rpartition(":")[0]
-        return _lacking_device(what, device, "dialout") or Finding(what, address)
-    if kind == "udp":
-        return _port(what, rest)
-    return Finding(what, f"{address} (reached when it answers)")
-
-
-def _lacking_device(what: str, device: str, group: str) -> Finding | None:
-    path = Path(device)
-    if not path.exists():
-        there = ", ".join(sorted(str(one) for one in path.parent.glob(path.name.rstrip("0123456789") + "*")))
-        return Finding(
-            what,
-            lacks=f"{device} is not there" + (f" (there are: {there})" if there else ""),
-            mend="connect it; ls /dev/tty* /dev/video*; then set it in the file",
-        )
-    if not os.access(path, os.R_OK | os.W_OK):
-        return Finding(
-            what,
-            lacks=f"this user may not use {device}",
-            mend=f"sudo usermod -aG {group} $USER, and log in anew",
-        )
-    return None
-
-
-def _port(what: str, address: str) -> Finding:
-    """Whether a UDP port can be had here."""
-    host, _, port = address.rpartition(":")
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        try:
-            probe.bind((host, int(port)))
-        except (OSError, OverflowError) as error:
-            return Finding(
-                what, lacks=f"udp {address}: {error}", mend=f"ss -lunp sport = :{port}; end that program"
-            )
-    return Finding(what, f"udp {address} is free")

@@ -67,18 +67,24 @@ def keys(
 def check(
     path: FleetFile = Path("fleet.toml"),
     drone: Annotated[int | None, typer.Option(help="What this drone lacks, on its own machine.")] = None,
+    boat: Annotated[bool, typer.Option("--boat", help="What the boat lacks, on its own machine.")] = False,
 ) -> None:
-    """Say what the fleet file, or one drone on its own machine, still lacks, and what mends it.
+    """Say what the fleet file, one drone or the boat on its own machine still lacks, and what mends it.
 
     Exit code 0 where nothing lacks, 2 for a fleet file that cannot be flown, 3 where something lacks.
     """
-    from tools.fleet.check import check_drone, check_fleet
+    from tools.fleet.check import check_boat, check_drone, check_fleet
     from tools.fleet.machine import read_fleet
 
     console = Console(highlight=False)
     with plain_errors():
+        if boat and drone is not None:
+            raise typer.BadParameter("a machine is a drone's or the boat's", param_hint="--boat")
         mission = read_fleet(path)
-        findings = check_fleet(mission, path) if drone is None else check_drone(mission, path, drone)
+        if drone is not None:
+            findings = check_drone(mission, path, drone)
+        else:
+            findings = (check_boat if boat else check_fleet)(mission, path)
     for one in findings:
         mark, style = ("lacks", "red") if one.lacks else ("ok   ", "green")
         console.print(f"[{style}]{mark}[/] {one.what:<10}", escape(one.lacks or one.found), soft_wrap=True)

@@ -15,9 +15,10 @@ from procs.settings import (
     load_mission,
 )
 
-__all__ = ["boat_radio", "drone_settings", "listen_address", "machine_of", "read_fleet"]
+__all__ = ["AUTOPILOT_DRIVER", "boat_radio", "drone_settings", "listen_address", "machine_of", "read_fleet"]
 
 LOOPBACK = "127."
+AUTOPILOT_DRIVER = "drivers.autopilots.mavlink_link:open_link"
 
 
 def read_fleet(path: Path) -> Mission:
@@ -61,9 +62,7 @@ def drone_settings(
     specs = {
         "camera": _camera(machine.camera, mission),
         "frames": _spec("drivers.frames:SharedFrames", run=run, drone_id=drone_id),
-        "autopilot": _spec(
-            "drivers.autopilots.mavlink_link:open_link", address=machine.autopilot, system_id=drone_id
-        ),
+        "autopilot": _spec(AUTOPILOT_DRIVER, address=machine.autopilot, system_id=drone_id),
         "radio": _radio(mission, drone_id, machine.radio),
         "detector": _spec("procs.detector.yolo:Detector", **mission.detector.options()),
         "tracker": _spec("procs.tracker.mask_tracker:MaskTracker"),
