@@ -8,6 +8,7 @@ import sys
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -18,7 +19,7 @@ from tools import errors
 from tools.buses import N_SLOTS, bus_url, free_udp_ports
 from tools.cli import app
 from tools.doctor import machine
-from tools.doctor.mend import as_root
+from tools.doctor.mend import as_root, restored_model
 from tools.findings import Finding
 from tools.fleet.edges import check_autopilot
 from tools.fleet.machine import machine_of, read_fleet
@@ -160,7 +161,34 @@ def test_a_broken_model_is_told(monkeypatch, tmp_path, kept):
     model.write_bytes(path("detector.onnx").read_bytes()[:kept])
     said = broken(monkeypatch, "check_model", path=model)
     assert str(model) in said
-    assert "checkout models/detector.onnx" in said or "pip install --force-reinstall" in said
+    assert restored_model() in said
+
+
+def test_a_model_comes_back_from_the_checkout_or_from_where_it_was_installed(monkeypatch, tmp_path):
+    (tmp_path / "a copy" / ".git").mkdir(parents=True)
+    copy = tmp_path / "a copy"
+    assert restored_model(copy) == f"git -C '{copy}' checkout models/detector.onnx"
+    wheel = SimpleNamespace(read_text=lambda _: '{"url": "file:///srv/podwatch-0.1.0.whl"}')
+    for told, source in (
+        (wheel, "file:///srv/podwatch-0.1.0.whl"),
+        (SimpleNamespace(read_text=lambda _: None), "PATH"),
+    ):
+        monkeypatch.setattr("importlib.metadata.distribution", lambda _, told=told: told)
+        command = restored_model(tmp_path)
+        assert f"pip install --force-reinstall --no-deps {source}" in command, "it is in no registry"
+
+
+def test_a_checkout_whose_model_is_lost_is_mended_by_what_is_told(tmp_path):
+    root = tmp_path / "podwatch"
+    (root / "models").mkdir(parents=True)
+    model = root / "models" / "detector.onnx"
+    model.write_bytes(b"whole")
+    git = ["git", "-C", str(root), "-c", "user.name=a", "-c", "user.email=a@b"]
+    for words in (["init", "-q"], ["add", "."], ["commit", "-q", "-m", "all"]):
+        subprocess.run([*git, *words], check=True)
+    model.write_bytes(b"wh")
+    subprocess.run(restored_model(root), shell=True, check=True, capture_output=True)
+    assert model.read_bytes() == b"whole"
 
 
 def test_a_key_that_others_can_read_is_told(fleet):

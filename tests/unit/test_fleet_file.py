@@ -16,11 +16,13 @@ from typer.testing import CliRunner
 
 from procs.bus_executor import load_driver
 from procs.relay.keys import read_key
+from procs.runtime import RuntimeFailure
 from procs.settings import Mission, MissionError, load_mission
 from tests.talker import beat, talking
 from tools import errors
 from tools.buses import free_udp_ports
 from tools.cli import app
+from tools.doctor.mend import restored_model
 from tools.findings import Finding
 from tools.fleet import check
 from tools.fleet.machine import boat_radio, drone_settings, machine_of, read_fleet
@@ -208,6 +210,17 @@ def test_a_pipeline_that_the_installed_opencv_cannot_open_is_told_as_that(monkey
     said = lacking(fleet, "--drone", 1)
     assert "gstreamer:videotestsrc ! appsink: the OpenCV that pip installs is built without GStreamer" in said
     assert '"ffmpeg:ADDRESS"' in said
+
+
+def test_a_model_that_is_broken_is_brought_back_as_doctor_says(monkeypatch, fleet):
+    def broken(spec):
+        if "Detector" in spec.driver:
+            raise RuntimeFailure("detector.onnx: it is cut")
+        return load_driver(spec)
+
+    monkeypatch.setattr(check, "LISTEN_S", 0.05)
+    monkeypatch.setattr(check, "load_driver", broken)
+    assert restored_model() in lacking(fleet, "--drone", 1)
 
 
 def test_members_that_share_an_address_or_have_none_are_named(fleet):

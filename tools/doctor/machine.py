@@ -16,7 +16,7 @@ from procs.bus_executor import ROUTE_COMMAND
 from procs.detector.decode import ModelError
 from procs.settings import CameraSettings
 from tools.buses import FIRST_PORT, N_SLOTS, has_multicast_route, taken_slots
-from tools.doctor.mend import as_root
+from tools.doctor.mend import SHIPPED, as_root, restored_model
 from tools.findings import Finding
 from tools.spy.gui import what_is_missing
 
@@ -36,7 +36,6 @@ GROUP = "239.255.76.100"  # no drone's: ids begin at 1
 HEAR_S = 0.5
 LOOPBACK = "127."
 SLOTS_OF_A_RING = 16  # frames that drivers.frames keeps
-SHIPPED = "detector.onnx"
 
 
 def check_route(*, on_drone: bool = False) -> Finding:
@@ -140,11 +139,7 @@ def check_model(path: Path | None = None) -> Finding:
     try:
         Detector(path or shipped)
     except ModelError as error:
-        root = shipped.parents[1]
-        mend = f"{shutil.which('python3') or 'python3'} -m pip install --force-reinstall --no-deps podwatch"
-        if (root / ".git").exists():
-            mend = f"git -C {root} checkout models/{SHIPPED}"
-        return Finding("model", lacks=str(error), mend=mend)
+        return Finding("model", lacks=str(error), mend=restored_model())
     return Finding("model", f"{(path or shipped).name} loads and runs")
 
 

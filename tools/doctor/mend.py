@@ -1,10 +1,44 @@
 """Commands that people are given to mend something."""
 
+import json
 import os
+import shlex
+import sys
+from importlib import metadata
+from pathlib import Path
 
-__all__ = ["as_root"]
+import models
+
+__all__ = ["SHIPPED", "as_root", "restored_model"]
+
+SHIPPED = "detector.onnx"
 
 
 def as_root(command: str) -> str:
     """The command as this user must give it."""
     return command if os.geteuid() == 0 else f"sudo {command}"
+
+
+def restored_model(root: Path | None = None) -> str:
+    """What brings the model that ships back. root: the folder of our packages.
+
+    podwatch is in no registry: a checkout has its own history, anything else is installed again from where it
+    came.
+    """
+    root = root or Path(models.__file__).parents[1]
+    if (root / ".git").exists():
+        return f"git -C {shlex.quote(str(root))} checkout models/{SHIPPED}"
+    again = f"{shlex.quote(sys.executable)} -m pip install --force-reinstall --no-deps"
+    source = _installed_from()
+    if source:
+        return f"{again} {shlex.quote(source)}"
+    return f"{again} PATH  # of podwatch's folder or wheel"
+
+
+def _installed_from() -> str:
+    """What pip installed podwatch from (PEP 610); "" where that was not written down."""
+    try:
+        told = metadata.distribution("podwatch").read_text("direct_url.json")
+    except metadata.PackageNotFoundError:
+        return ""
+    return str(json.loads(told)["url"]) if told else ""

@@ -10,6 +10,7 @@ from procs.relay.keys import FleetKeyError, read_key
 from procs.runtime import RuntimeFailure
 from procs.settings import DriverSpec, Mission
 from tools.doctor.machine import check_receive_buffer, check_route, check_shared_memory, frames_bytes
+from tools.doctor.mend import restored_model
 from tools.findings import Finding
 from tools.fleet.edges import check_autopilot, check_camera, check_radio
 from tools.fleet.machine import AUTOPILOT_DRIVER, drone_settings, machine_of
@@ -140,6 +141,6 @@ def _model(spec: DriverSpec) -> Finding:
     try:
         load_driver(spec)
     except RuntimeFailure as error:
-        mend = "[detector] model = ...: another file" if own else "pip install --force-reinstall podwatch"
+        mend = "[detector] model = ...: another file" if own else restored_model()
         return Finding("model", lacks=str(error), mend=mend)
     return Finding("model", str(own or "the detector that ships"))
