@@ -70,31 +70,33 @@ class Section(BaseModel):
 class OriginSettings(Section):
     """The fleet's origin: n = e = 0 of every local frame, d = 0 the surface."""
 
-    latitude_deg: float = Field(15.30, ge=-90, le=90)
-    longitude_deg: float = Field(-61.50, ge=-180, le=180)
-    altitude_m: float = Field(0.0, ge=-500, le=9000)
+    latitude_deg: float = Field(15.30, ge=-90, le=90)  # of the take-off place, as decimal degrees
+    longitude_deg: float = Field(-61.50, ge=-180, le=180)  # of the take-off place; west is negative
+    altitude_m: float = Field(0.0, ge=-500, le=9000)  # of the water above mean sea level
 
 
 class CameraSettings(Section):
     """The downward camera, alike on every drone."""
 
-    width_px: int = Field(640, ge=160, le=4096)
-    height_px: int = Field(480, ge=120, le=4096)
-    vfov_deg: float = Field(60.0, gt=10, lt=150)
-    rate_hz: float = Field(20.0, ge=1, le=60)
-    preview_hz: float = Field(2.0, ge=0.2, le=5)
-    detect_hz: float = Field(5.0, ge=0.5, le=30)
+    width_px: int = Field(640, ge=160, le=4096)  # of a picture
+    height_px: int = Field(480, ge=120, le=4096)  # of a picture
+    vfov_deg: float = Field(60.0, gt=10, lt=150)  # vertical field of view, as calibrated
+    rate_hz: float = Field(20.0, ge=1, le=60)  # pictures a second
+    preview_hz: float = Field(2.0, ge=0.2, le=5)  # small pictures a second for log and report
+    detect_hz: float = Field(5.0, ge=0.5, le=30)  # pictures a second in which animals are looked for
 
 
 class DetectorSettings(Section):
     """The model that finds animals, and how it is used."""
 
     model: str = ""  # an ONNX file, from the fleet file's folder; empty: the one that ships
-    confidence: float = Field(0.25, ge=0.01, le=1)  # least score
+    confidence: float = Field(0.25, ge=0.01, le=1)  # least score of a find
     iou: float = Field(0.45, ge=0, le=1)  # of two boxes that overlap by more the lesser goes
     classes: tuple[int | str, ...] = ()  # numbers or names of the model's classes; empty: all
-    tile: int | Literal["auto", "off"] = "auto"  # auto: where animals are too small; a number: px, always
+    # auto: where animals are too small; a side in px, 32 to 8192: always
+    tile: int | Literal["auto", "off"] = "auto"
     tile_limit_ms: float = Field(100.0, ge=1, le=5000)  # that a tiled frame may take where tile is auto
+    # what runs the network; where it is not there, the cpu does
     provider: Literal["cpu", "cuda", "tensorrt", "openvino"] = "cpu"
 
     @model_validator(mode="after")
@@ -119,49 +121,55 @@ class DetectorSettings(Section):
 class SearchSettings(Section):
     """Where and how the scout looks."""
 
-    start: Literal["auto", "operator"] = "auto"  # operator: only on the boat's order START
+    # auto: each as soon as it is ready; operator: on the boat's order START
+    start: Literal["auto", "operator"] = "auto"
+    # middle of the spiral, north of the origin: where people think the pod may be
     north_m: float = Field(100.0, ge=-20000, le=20000)
-    east_m: float = Field(0.0, ge=-20000, le=20000)
-    height_m: float = Field(40.0, ge=5, le=120)
-    speed_m_s: float = Field(6.0, gt=0, le=15)
-    radius_m: float = Field(150.0, ge=5, le=5000)
-    presence_share: float = Field(0.8, gt=0, le=1)  # of a buffer of recent frames (paper, Scouting)
-    presence_frames: int = Field(15, ge=3, le=200)
+    east_m: float = Field(0.0, ge=-20000, le=20000)  # east of the origin; below 0: west
+    height_m: float = Field(40.0, ge=5, le=120)  # of the scout
+    speed_m_s: float = Field(6.0, gt=0, le=15)  # of the scout, and of who waits over its home
+    radius_m: float = Field(150.0, ge=5, le=5000)  # of the spiral; it must lie inside the fence
+    # share of the recent pictures with animals in them that makes a find (paper, Scouting)
+    presence_share: float = Field(0.8, gt=0, le=1)
+    presence_frames: int = Field(15, ge=3, le=200)  # how many pictures are recent
 
 
 class WatchSettings(Section):
     """Gathering over the pod and watching one animal each."""
 
-    watch_s: float = Field(60.0, ge=1, le=7200)  # time in MONITOR before the fleet returns
+    watch_s: float = Field(60.0, ge=1, le=7200)  # how long animals are watched before the fleet returns
     height_m: float = Field(30.0, ge=5, le=120)  # height over the own animal
-    max_height_m: float = Field(60.0, ge=10, le=120)  # ceiling while gathering; partial views above it
+    max_height_m: float = Field(
+        60.0, ge=10, le=120
+    )  # ceiling while gathering, though less of the pod be in view
     separation_m: float = Field(8.0, ge=3, le=50)  # between neighbours on the gathering circle
-    animal_length_m: float = Field(10.0, gt=0.5, le=40)
-    speed_m_s: float = Field(8.0, gt=0, le=15)
-    max_animal_speed_m_s: float = Field(4.0, gt=0, le=15)
-    episode_limit_s: float = Field(5.0, ge=2, le=20)
+    animal_length_m: float = Field(10.0, gt=0.5, le=40)  # of a grown animal of this species
+    speed_m_s: float = Field(8.0, gt=0, le=15)  # of all flight to the pod, over it and home
+    max_animal_speed_m_s: float = Field(4.0, gt=0, le=15)  # an animal that is followed is taken for no faster
+    episode_limit_s: float = Field(5.0, ge=2, le=20)  # so long may the drones compare their views
 
 
 class AssignSettings(Section):
     """Who watches which animal."""
 
-    method: Literal["auto", "exact", "gnn", "gnn+resolve"] = "auto"  # auto: procs.assigner.rule decides
-    gain_m: float = Field(5.0, ge=0, le=500)  # saved for each drone that changes its animal
-    minute_watched_m: float = Field(1.0, ge=0, le=100)  # an animal is so much dearer a minute watched by any
+    method: Literal["auto", "exact", "gnn", "gnn+resolve"] = "auto"  # auto: what sends least
+    gain_m: float = Field(5.0, ge=0, le=500)  # only for so much saved does a drone change its animal
+    # so much farther counts an animal a minute that anybody has watched it: the others have their turn
+    minute_watched_m: float = Field(1.0, ge=0, le=100)
 
 
 class LimitSettings(Section):
     """What no setpoint may exceed; the bridge clamps to it at the last hop."""
 
-    speed_m_s: float = Field(10.0, gt=0, le=20)
-    climb_m_s: float = Field(3.0, gt=0, le=6)
-    descent_m_s: float = Field(2.0, gt=0, le=4)
-    min_height_m: float = Field(10.0, ge=2, le=100)
-    max_height_m: float = Field(80.0, ge=5, le=120)
-    fence_radius_m: float = Field(600.0, ge=20, le=20000)
-    battery_return: float = Field(0.25, ge=0.05, le=0.9)
-    battery_land: float = Field(0.10, ge=0.02, le=0.5)
-    setpoint_life_s: float = Field(0.5, ge=0.1, le=2.0)
+    speed_m_s: float = Field(10.0, gt=0, le=20)  # over the ground, at most
+    climb_m_s: float = Field(3.0, gt=0, le=6)  # upwards, at most
+    descent_m_s: float = Field(2.0, gt=0, le=4)  # downwards, at most
+    min_height_m: float = Field(10.0, ge=2, le=100)  # lowest flight, but for take-off and landing
+    max_height_m: float = Field(80.0, ge=5, le=120)  # highest flight
+    fence_radius_m: float = Field(600.0, ge=20, le=20000)  # of the circle round the origin that nobody leaves
+    battery_return: float = Field(0.25, ge=0.05, le=0.9)  # share of the charge: below it a drone goes home
+    battery_land: float = Field(0.10, ge=0.02, le=0.5)  # share of the charge: below it a drone lands at once
+    setpoint_life_s: float = Field(0.5, ge=0.1, le=2.0)  # after which a setpoint is obeyed no more
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
@@ -180,7 +188,8 @@ class RadioSettings(Section):
     """The ring's links."""
 
     bytes_per_s: int = Field(6000, ge=1500, le=1_000_000)  # cap for each link, headers and seal counted
-    lost_after_s: float = Field(3.0, ge=1, le=30)
+    lost_after_s: float = Field(3.0, ge=1, le=30)  # unheard for so long, a drone is lost to the others
+    # beside the fleet file; `podwatch fleet keys` makes it, a simulation its own
     key_file: str = "fleet.key"
 
 
@@ -197,40 +206,44 @@ class DriverSpec(Section):
     which.
     """
 
-    driver: str = Field(pattern=DRIVER)
-    options: dict[str, Any] = {}
+    driver: str = Field(pattern=DRIVER)  # where Python finds it
+    options: dict[str, Any] = {}  # its arguments by name
 
 
 class MachineSettings(Section):
     """What one drone's own computer is wired to: for `podwatch fly`, of no weight in a simulated fleet."""
 
-    camera: str = Field("v4l2:/dev/video0", pattern=CAMERA)
-    autopilot: str = Field("serial:/dev/ttyAMA0:921600", pattern=AUTOPILOT)
+    camera: str = Field("v4l2:/dev/video0", pattern=CAMERA)  # where pictures come from
+    autopilot: str = Field("serial:/dev/ttyAMA0:921600", pattern=AUTOPILOT)  # the link to the autopilot
     radio: str = Field(pattern=RADIO)  # where the others reach its relay
-    drivers: dict[str, DriverSpec] = {}  # in place of those that follow from the above
+    # in place of those that follow from the above: camera, frames, detector, tracker, autopilot, radio, clock
+    drivers: dict[str, DriverSpec] = {}
 
 
 class BoatSettings(Section):
     """The boat, roster member 0."""
 
     radio: str = Field("", pattern=RADIO_OR_NONE)  # where the drones reach it; empty: there is none
-    lost_return_s: float = Field(0.0, ge=0, le=3600)  # silent for so long, it is lost: home. 0: they fly on
+    lost_return_s: float = Field(
+        0.0, ge=0, le=3600
+    )  # silent for so long, it is lost and all go home; 0: never
     drivers: dict[str, DriverSpec] = {}  # its clock, where that is not the machine's
 
 
 class DroneEntry(Section):
-    """One drone of the roster."""
+    """One drone of the roster; a file that names none has three, 10 m apart."""
 
-    id: int = Field(ge=1, le=99)
+    id: int = Field(ge=1, le=99)  # its place in the ring, and its autopilot's system id
+    # where it stands before take-off, north of the origin; 3 m or more from the others
     home_n_m: float = Field(0.0, ge=-1000, le=1000)
-    home_e_m: float = Field(0.0, ge=-1000, le=1000)
+    home_e_m: float = Field(0.0, ge=-1000, le=1000)  # east of the origin; below 0: west
     machine: MachineSettings | None = None
 
 
 class Mission(Section):
     """A mission file: everything that every drone of a fleet is told."""
 
-    name: str = "mission"
+    name: str = "mission"  # what people read on screens and in reports
     origin: OriginSettings = OriginSettings()
     drones: tuple[DroneEntry, ...] = tuple(DroneEntry(id=i, home_e_m=10.0 * (i - 1)) for i in (1, 2, 3))
     camera: CameraSettings = CameraSettings()

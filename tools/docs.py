@@ -1,14 +1,18 @@
-"""Pages of the docs made from the code: `python -m tools.docs` writes docs/processes.md and docs/channels.md.
+"""Pages of the docs made from the code: `python -m tools.docs` writes docs/processes.md, docs/channels.md and
+docs/mission.md.
 
 A test compares the files with what this module makes, so that the docs say what the tables say.
 """
 
 import ast
+from collections.abc import Callable
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 
 from lcmtypes.channels import CHANNELS
 from procs.processes import PROCESSES
+from tools.docs_mission import mission_page
 
 __all__ = ["PAGES", "channels_page", "processes_page"]
 
@@ -58,7 +62,11 @@ def channels_page() -> str:
     return "\n".join([*lines, ""])
 
 
-PAGES = {"processes.md": processes_page, "channels.md": channels_page}
+PAGES: dict[str, Callable[[], str]] = {
+    "processes.md": processes_page,
+    "channels.md": channels_page,
+    "mission.md": partial(mission_page, MADE),
+}
 
 
 def main() -> None:
