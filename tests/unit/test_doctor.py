@@ -95,7 +95,10 @@ def test_a_drones_bus_that_leaves_the_loopback_is_told(monkeypatch):
     monkeypatch.setattr(machine, "_source_address", lambda: "10.1.2.3")
     finding = machine.check_route(on_drone=True)
     assert "interface of 10.1.2.3" in finding.lacks
-    assert finding.mend == as_root("ip route replace 239.255.76.0/24 dev lo")
+    assert finding.mend.startswith(
+        as_root("ip route replace 239.255.76.0/24 dev lo") + "  # until the next boot"
+    )
+    assert "podwatch-N-net.service" in finding.mend
 
 
 def test_a_bus_that_is_not_heard_is_told(monkeypatch):
@@ -109,7 +112,8 @@ def test_a_kernel_that_grants_less_than_is_wanted_is_told(monkeypatch):
     granted = machine.check_receive_buffer(1 << 30)
     assert granted.lacks, "no kernel grants a bus 1 GiB"
     said = broken(monkeypatch, "check_receive_buffer", wanted_bytes=1 << 30)
-    assert as_root(f"sysctl -w net.core.rmem_max={1 << 30}") in said
+    assert f"echo net.core.rmem_max={1 << 30} | {as_root('tee /etc/sysctl.d/90-podwatch.conf')} && " in said
+    assert as_root("sysctl -p /etc/sysctl.d/90-podwatch.conf") in said, "at once, and at every boot"
     monkeypatch.undo()
     assert machine.check_receive_buffer(4096).lacks == ""
     assert machine.RECEIVE_BYTES == 4194304
@@ -137,9 +141,11 @@ def test_no_free_slot_is_told(monkeypatch):
 def test_shared_memory_that_is_full_or_read_only_is_mended_by_what_is_told(tmp_path, options, mend):
     if can_unshare():
         check = f"{PODWATCH} doctor --only shm > {tmp_path}/said; echo exit $?; cat {tmp_path}/said;"
-        told = f"$(grep remount {tmp_path}/said)"
+        told = f'eval "$(grep remount {tmp_path}/said)"'
         said = apart(f"mount -t tmpfs -o {options} tmpfs /dev/shm && {check} {told} && {check}")
         assert mend in said
+        assert "for good" in said
+        assert "/etc/fstab" in said
         assert [line for line in said.splitlines() if line.startswith("exit")] == ["exit 3", "exit 0"], said
     else:
         free_bytes = shutil.disk_usage(tmp_path).free

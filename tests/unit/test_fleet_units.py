@@ -2,6 +2,7 @@
 
 import shutil
 import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,11 +13,13 @@ from procs import processes
 from procs.processes import PROCESSES, Restart
 from procs.relay.keys import make_key
 from procs.settings import DroneSettings
+from tools.buses import bus_url
 from tools.fleet import units
 from tools.fleet.machine import read_fleet
 from tools.fleet.template import fleet_text
 
 DRONE = 2
+NAMESPACES = ("unshare", "--map-root-user", "--net")
 
 
 class Unit:
@@ -53,6 +56,7 @@ def test_every_process_has_its_unit_and_systemd_finds_nothing_wrong(mission, tmp
     assert named == {
         "drone_2.json",
         "podwatch-2.target",
+        "podwatch-2-net.service",
         *(f"podwatch-2-{process.name}.service" for process in PROCESSES),
     }
     checker = shutil.which("systemd-analyze")
@@ -86,6 +90,31 @@ def test_units_stop_in_the_order_of_the_table(mission, tmp_path):
         later = {p.name for p in PROCESSES if p.stop_order > process.stop_order}
         assert {name for name in processes.BY_NAME if units.unit_name(DRONE, name) in after} == later
         assert made[process.name].get("PartOf") == "podwatch-2.target"
+
+
+def test_the_bus_has_its_route_before_any_process_starts(mission, tmp_path):
+    made = written(mission, tmp_path / "units")
+    for unit in made.values():
+        assert "podwatch-2-net.service" in unit.get("Wants").split()
+        assert "podwatch-2-net.service" in unit.get("After").split()
+    net = Unit(tmp_path / "units" / "podwatch-2-net.service")
+    assert (net.get("Type"), net.get("RemainAfterExit")) == ("oneshot", "yes")
+    assert "239.255.76.0/24 dev lo" in net.get("ExecStart")
+    assert "-ge 4194304" in net.get("ExecStart"), "a kernel that grants more keeps it"
+
+
+def test_what_the_network_unit_starts_makes_a_bus_where_there_is_none(mission, tmp_path):
+    written(mission, tmp_path / "units")
+    lines = (tmp_path / "units" / "podwatch-2-net.service").read_text().splitlines()
+    starts = [line.partition("=")[2].replace("$$", "$") for line in lines if line.startswith("ExecStart=")]
+    commands = [f"{one[1:]} || true" if one.startswith("-") else one for one in starts]
+    assert len(commands) == 3
+    if shutil.which("unshare") is None or subprocess.run([*NAMESPACES, "true"], check=False).returncode != 0:
+        return  # no machine of one's own to try them on
+    bus = f"{sys.executable} -c 'import lcm; lcm.LCM({chr(34)}{bus_url(DRONE, 0)}{chr(34)})'"
+    for script, code in ((bus, 1), (" && ".join([*commands, bus]), 0)):
+        done = subprocess.run([*NAMESPACES, "sh", "-c", script], capture_output=True, text=True, check=False)
+        assert done.returncode == code, done.stdout + done.stderr
 
 
 def test_each_has_only_the_rights_that_it_needs(mission, tmp_path):

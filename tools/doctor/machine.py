@@ -16,7 +16,7 @@ from procs.bus_executor import ROUTE_COMMAND
 from procs.detector.decode import ModelError
 from procs.settings import CameraSettings
 from tools.buses import FIRST_PORT, N_SLOTS, has_multicast_route, taken_slots
-from tools.doctor.mend import SHIPPED, as_root, restored_model
+from tools.doctor.mend import SHIPPED, as_root, restored_model, until_boot
 from tools.findings import Finding
 from tools.spy.gui import what_is_missing
 
@@ -31,6 +31,7 @@ __all__ = [
     "frames_bytes",
 ]
 
+SYSCTL_FILE = "/etc/sysctl.d/90-podwatch.conf"  # read at every boot
 RECEIVE_BYTES = 4194304  # every bus asks for it: with less, long messages are lost (docs/architecture.md)
 GROUP = "239.255.76.100"  # no drone's: ids begin at 1
 HEAR_S = 0.5
@@ -42,7 +43,7 @@ def check_route(*, on_drone: bool = False) -> Finding:
     """Whether a message to a drone's group leaves and is heard again; on a drone, over the loopback alone."""
     what = "multicast"
     up = f"{as_root('ip link set lo up')} && " if not _is_loopback_up() else ""
-    mend = up + as_root(ROUTE_COMMAND)
+    mend = until_boot(up + as_root(ROUTE_COMMAND), "podwatch-N-net.service of `podwatch fleet units`")
     if not has_multicast_route():
         return Finding(what, lacks="no multicast route: there can be no bus", mend=mend)
     source = _source_address()
@@ -64,10 +65,11 @@ def check_receive_buffer(wanted_bytes: int = RECEIVE_BYTES) -> Finding:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, wanted_bytes)
         granted_bytes = probe.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // 2  # Linux doubles it
     if granted_bytes < wanted_bytes:
+        kept = f"echo net.core.rmem_max={wanted_bytes} | {as_root(f'tee {SYSCTL_FILE}')}"
         return Finding(
             "rmem_max",
             lacks=f"{granted_bytes} bytes, {wanted_bytes} wanted: long messages will be lost",
-            mend=as_root(f"sysctl -w net.core.rmem_max={wanted_bytes}"),
+            mend=f"{kept} && {as_root(f'sysctl -p {SYSCTL_FILE}')}",
         )
     return Finding("rmem_max", f"a bus may hold {granted_bytes} bytes")
 
@@ -119,7 +121,7 @@ def check_shared_memory(wanted_bytes: int, folder: Path = SHARED_FOLDER) -> Find
             return Finding(
                 what,
                 lacks=f"it cannot be written: {error.strerror}",
-                mend=as_root(f"mount -o remount,rw {folder}"),
+                mend=until_boot(as_root(f"mount -o remount,rw {folder}"), f"rw for {folder} in /etc/fstab"),
             )
     finally:
         with contextlib.suppress(OSError):
@@ -127,7 +129,11 @@ def check_shared_memory(wanted_bytes: int, folder: Path = SHARED_FOLDER) -> Find
     if free_bytes < wanted_bytes:
         lacks = f"{_mb(free_bytes)} MB are free, {_mb(wanted_bytes)} MB wanted for the frames"
         size_mb = _mb(shutil.disk_usage(folder).used + wanted_bytes) + 1
-        return Finding(what, lacks=lacks, mend=as_root(f"mount -o remount,size={size_mb}M {folder}"))
+        mend = until_boot(
+            as_root(f"mount -o remount,size={size_mb}M {folder}"),
+            f"in /etc/fstab: tmpfs {folder} tmpfs size={size_mb}M 0 0",
+        )
+        return Finding(what, lacks=lacks, mend=mend)
     return Finding(what, f"{_mb(free_bytes)} MB free, {_mb(wanted_bytes)} MB wanted")
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import models
 
-__all__ = ["SHIPPED", "as_root", "restored_model"]
+__all__ = ["SHIPPED", "as_root", "restored_model", "until_boot"]
 
 SHIPPED = "detector.onnx"
 
@@ -17,6 +17,11 @@ SHIPPED = "detector.onnx"
 def as_root(command: str) -> str:
     """The command as this user must give it."""
     return command if os.geteuid() == 0 else f"sudo {command}"
+
+
+def until_boot(command: str, for_good: str) -> str:
+    """A command whose work the next boot undoes, and what does it at every boot."""
+    return f"{command}  # until the next boot; for good: {for_good}"
 
 
 def restored_model(root: Path | None = None) -> str:

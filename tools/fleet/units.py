@@ -1,18 +1,20 @@
 """systemd units of one drone, from the fleet file and the process table.
 
-One unit a process and a target for all of them. A unit cannot know whether its drone flies, so it restarts
-by the table's policy for the air. It waits for the process's first heartbeat (Type=notify) and ends a process
-whose heartbeat is missing for the table's limit (WatchdogSec). What must stop later is started before:
-systemd stops units against the order of After=.
+One unit a process, one for the network of the bus, and a target for all of them. A unit cannot know whether
+its drone flies, so it restarts by the table's policy for the air. It waits for the process's first heartbeat
+(Type=notify) and ends a process whose heartbeat is missing for the table's limit (WatchdogSec). What must stop
+later is started before: systemd stops units against the order of After=.
 """
 
 import os
 import sys
 from pathlib import Path
 
+from procs.bus_executor import ROUTE_COMMAND
 from procs.processes import PROCESSES, Process, Restart
 from procs.settings import DroneSettings, MachineSettings, Mission
 from tools.buses import bus_url
+from tools.doctor.machine import RECEIVE_BYTES
 from tools.fleet.machine import drone_settings, machine_of
 
 __all__ = ["STATE_FOLDER", "unit_name", "write_units"]
@@ -22,6 +24,8 @@ STATE_FOLDER = Path("/var/lib/podwatch")
 STOP_WAIT_S = 6
 RESTART_WAIT_S = 1
 CREDENTIAL = "fleet.key"
+NET = "net"  # no process: the unit that sets up the bus's network
+RMEM_MAX = "net.core.rmem_max"
 SLOT = 0  # one drone's computer carries one drone's bus
 
 # What every process does without (systemd.exec(5)).
@@ -65,6 +69,8 @@ def write_units(mission: Mission, drone_id: int, out: Path) -> list[Path]:
     settings_path.write_text(_settings(mission, drone_id).model_dump_json(indent=1) + "\n")
     files = [settings_path, out / _target(drone_id)]
     files[1].write_text(_target_text(mission, drone_id))
+    files.append(out / unit_name(drone_id, NET))
+    files[-1].write_text(_net_text(drone_id))
     for process in PROCESSES:
         files.append(out / unit_name(drone_id, process.name))
         files[-1].write_text(_unit_text(process, drone_id, machine, settings_path, key))
@@ -97,15 +103,34 @@ def _target_text(mission: Mission, drone_id: int) -> str:
     )
 
 
+def _net_text(drone_id: int) -> str:
+    """What a boot forgets and the bus needs: its route, and the kernel's leave to hold long messages."""
+    room = f'test "$$(sysctl -n {RMEM_MAX})" -ge {RECEIVE_BYTES} || sysctl -w {RMEM_MAX}={RECEIVE_BYTES}'
+    return (
+        f"[Unit]\n"
+        f"Description=podwatch: the network of drone {drone_id}'s bus\n"
+        f"PartOf={_target(drone_id)}\n"
+        f"\n[Service]\n"
+        f"Type=oneshot\n"
+        f"RemainAfterExit=yes\n"
+        f"ExecStart=ip link set lo up\n"
+        f"ExecStart={ROUTE_COMMAND}\n"
+        f"ExecStart=-/bin/sh -c '{room}'\n"
+        f"\n[Install]\nWantedBy=multi-user.target\n"
+    )
+
+
 def _unit_text(process: Process, drone_id: int, machine: MachineSettings, settings: Path, key: str) -> str:
     later = [unit_name(drone_id, other.name) for other in PROCESSES if other.stop_order > process.stop_order]
-    after = " ".join(["network.target", *later])
+    net = unit_name(drone_id, NET)
+    after = " ".join(["network.target", net, *later])
     restart = "always" if process.restart_air is Restart.ALWAYS else "no"
     root = Path(__file__).resolve().parents[2]
     return (
         f"[Unit]\n"
         f"Description=podwatch {process.name} of drone {drone_id}\n"
         f"PartOf={_target(drone_id)}\n"
+        f"Wants={net}\n"
         f"After={after}\n"
         f"StartLimitIntervalSec=0\n"
         f"\n[Service]\n"
