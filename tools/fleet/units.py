@@ -2,8 +2,8 @@
 
 One unit a process, one for the network of the bus, and a target for all of them. A unit cannot know whether
 its drone flies, so it restarts by the table's policy for the air. It waits for the process's first heartbeat
-(Type=notify) and ends a process whose heartbeat is missing for the table's limit (WatchdogSec). What must stop
-later is started before: systemd stops units against the order of After=.
+(Type=notify) and ends a process whose heartbeat is missing for the table's limit (WatchdogSec). What must
+stop later is started before: systemd stops units against the order of After=.
 """
 
 import os
