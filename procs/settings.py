@@ -36,7 +36,7 @@ __all__ = [
 
 MAX_DRONES = 63  # members travel as a bitmap of 64 bits, signed
 LEAST_HOME_SPACING_M = 3.0  # nearer homes let two drones land on each other
-# A drone never flies nearer to its fence: what lies beyond is never reached (AUTOPILOT fact 11).
+# A drone never flies nearer to its fence: what lies beyond is never reached (docs/autopilot_facts.md, 11).
 FENCE_KEPT_M = 3.0
 LEAST_TILE_PX = 32
 # What a text must look like, and the same in words, which are what people are told.

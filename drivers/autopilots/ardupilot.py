@@ -26,7 +26,7 @@ GROUND_SYSTEM = 255  # whose HEARTBEAT feeds the ground-station failsafe
 AUTOPILOT_COMPONENT = 1
 
 # Type masks of SET_POSITION_TARGET_LOCAL_NED; a set bit means "ignore this field". Yaw is always sent:
-# without it the nose turns along the path (../shared/AUTOPILOT.md, facts 5 and 6, which measured the same
+# without it the nose turns along the path (docs/autopilot_facts.md, 5 and 6, which measured the same
 # masks without yaw).
 POSITION_YAW = 0x9F8
 VELOCITY_YAW = 0x9C7

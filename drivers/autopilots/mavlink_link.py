@@ -84,7 +84,7 @@ class MavlinkUdpClient(MavlinkUdp):
 class MavlinkTcp:
     """A TCP client that connects again by itself after the autopilot restarts.
 
-    Prefer UDP: an autopilot's TCP port serves one client (../shared/AUTOPILOT.md, fact 13).
+    Prefer UDP: an autopilot's TCP port serves one client (docs/autopilot_facts.md, 13).
     """
 
     def __init__(self, address: str, system_id: int = 0) -> None:

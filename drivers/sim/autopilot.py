@@ -1,6 +1,6 @@
 """The twin of an ArduCopter: real MAVLink bytes in and out, flown in the simulator.
 
-It imitates what was measured of the real one (../shared/AUTOPILOT.md): streams only on request, silence to
+It imitates what was measured of the real one (docs/autopilot_facts.md): streams only on request, silence to
 unknown parameters, setpoints without acknowledgement, its own local origin. The rules of flight are in
 drivers.sim.autopilot_flight, the errors of its sensors in drivers.sim.autopilot_estimate, the physics in
 drivers.sim.vehicle.

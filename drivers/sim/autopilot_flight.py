@@ -1,6 +1,6 @@
 """How the simulated autopilot flies: modes, arming, take-off, the life of setpoints, failsafes, fence.
 
-Each rule imitates a measured fact of ../shared/AUTOPILOT.md, named in the comments. No MAVLink here: see
+Each rule imitates a measured fact of docs/autopilot_facts.md, named in the comments. No MAVLink here: see
 drivers.sim.autopilot.
 """
 

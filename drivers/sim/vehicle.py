@@ -2,7 +2,7 @@
 
 A target is first shaped into a path that a copter can follow (limited speed, acceleration and jerk); a
 position and velocity controller then asks for an acceleration, the attitude follows it with a lag, and wind
-and drag push. The constants are chosen so that the vehicle meets the times of ../shared/AUTOPILOT.md, fact
+and drag push. The constants are chosen so that the vehicle meets the times of docs/autopilot_facts.md, fact
 15; tests/unit/test_vehicle.py holds them. Plain floats: at 50 Hz a copter costs a thousandth of a core, with
 arrays ten times as much.
 """

@@ -1,6 +1,6 @@
 """The bridge's core: MAVLink bytes in and out, setpoints in, the vehicle's state out. No clock, no socket.
 
-Every rule follows a measured fact of ../shared/AUTOPILOT.md; docs/autopilot.md tells them in words. Three
+Every rule follows a measured fact of docs/autopilot_facts.md; docs/autopilot.md tells them in words. Three
 rules are never broken: a setpoint older than its expiry is never sent; whoever takes the vehicle out of our
 modes (the pilot's stick, a failsafe) keeps it; the bridge never disarms.
 """

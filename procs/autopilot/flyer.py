@@ -1,7 +1,7 @@
 """What the bridge makes of a setpoint: the order of commands at take-off, limits, watchdog, hand-over to the
 pilot.
 
-Each rule follows a fact of ../shared/AUTOPILOT.md, named in the comments; docs/autopilot.md tells them in
+Each rule follows a fact of docs/autopilot_facts.md, named in the comments; docs/autopilot.md tells them in
 words.
 """
 

@@ -59,7 +59,7 @@ class Follower:
     """A point that travels to a goal as a copter can, inside the envelope.
 
     A far goal alone would be flown at the autopilot's own speed, and a stream of positions lags 7 m at 4 m/s;
-    with the velocity as feed-forward it lags 0.1 m (../shared/AUTOPILOT.md, fact 9).
+    with the velocity as feed-forward it lags 0.1 m (docs/autopilot_facts.md, fact 9).
     """
 
     def __init__(self, envelope: Envelope, place: Vector, velocity: Vector) -> None:

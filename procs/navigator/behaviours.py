@@ -66,8 +66,8 @@ landed = idle
 
 
 def takeoff(now: Situation, memory: Memory, camera: Pinhole) -> Step:
-    """Climbs over its home to its own layer; a setpoint of another kind would end the climb (AUTOPILOT fact
-    7).
+    """Climbs over its home to its own layer; a setpoint of another kind would end the climb
+    (docs/autopilot_facts.md, 7).
     """
     goal = now.home
     goal[:2] = now.position[:2]

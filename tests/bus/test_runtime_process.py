@@ -93,7 +93,7 @@ def test_a_hung_handler_is_ended_by_the_kernel(bench):
 
 
 def test_signals_by_the_hundred_between_messages_break_nothing(bench):
-    """A signal during LCM's own wait raises OSError: the runtime waits in select (fact 3)."""
+    """A signal in LCM's own wait raises OSError: the runtime waits in select (test_lcm_facts.py, fact 3)."""
     bench.start("-c", SHELL.replace("runtime.run()", HARMLESS), "SETTINGS", "quick")
     bench.await_that(lambda: bench.beats)
     for round_number in range(1, 21):

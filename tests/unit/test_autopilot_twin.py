@@ -1,4 +1,5 @@
-"""The simulated autopilot does what was measured of a real one; numbers are facts of AUTOPILOT.md."""
+"""The simulated autopilot does what was measured of a real one; numbers are those of
+docs/autopilot_facts.md."""
 
 import math
 

@@ -65,3 +65,17 @@ def test_the_example_of_the_mission_page_is_a_mission(tmp_path: Path) -> None:
 def test_the_mission_page_names_every_species_that_can_be_drawn() -> None:
     words = comments(PodTable)["species"]
     assert set(re.findall(r"\w+", words)) - {"or"} == {*SPECIES, *MORE_SPECIES}
+
+
+def test_no_cited_fact_of_the_autopilot_leads_nowhere() -> None:
+    told = set(re.findall(r"^\| (\d+) \|", (ROOT / "docs" / "autopilot_facts.md").read_text(), re.MULTILINE))
+    folders = [ROOT / name for name in ("procs", "drivers")]
+    sources = [path for folder in folders for path in sorted(folder.rglob("*.py"))]
+    cited = re.findall(r"\((\d+)\)", (ROOT / "docs" / "autopilot.md").read_text())
+    for path in sources:
+        text = path.read_text()
+        assert "shared/AUTOPILOT" not in text, f"{path}: name docs/autopilot_facts.md"
+        for numbers in re.findall(r"(?:\bfacts?|autopilot_facts\.md,)\s+(\d+(?:(?:,| and)\s\d+)*)", text):
+            cited += re.findall(r"\d+", numbers)
+    assert len(cited) > 30
+    assert sorted(set(cited) - told) == []

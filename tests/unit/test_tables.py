@@ -219,7 +219,7 @@ def test_a_member_with_a_unit_in_its_name_gives_the_same_unit_in_its_comment(pat
 
 
 def test_every_type_is_generated_and_no_two_types_can_be_taken_for_each_other():
-    """A fingerprint covers member names and types only (docs/architecture.md, fact 5)."""
+    """A fingerprint covers member names and types only (tests/bus/test_lcm_facts.py, fact 5)."""
     kinds = [path.stem for path in lcm_files()]
     fingerprints = {getattr(podwatch, kind)._get_packed_fingerprint(): kind for kind in kinds}
     assert len(fingerprints) == len(kinds)

@@ -1,4 +1,4 @@
-"""The simulated copter meets the times measured of a real one (../shared/AUTOPILOT.md, facts 9, 15)."""
+"""The simulated copter meets the times measured of a real one (docs/autopilot_facts.md, facts 9, 15)."""
 
 import math
 
