@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 from procs.bus_executor import load_driver
 from procs.relay.keys import read_key
 from procs.runtime import RuntimeFailure
-from procs.settings import Mission, MissionError, load_mission
+from procs.settings import MAX_DRONES, Mission, MissionError, load_mission
 from tests.talker import beat, talking
 from tools import errors
 from tools.buses import free_udp_ports
@@ -81,6 +81,15 @@ def test_a_new_file_loads_as_a_mission_and_flies_as_a_rehearsal(tmp_path, n_dron
         "most values say what they are for"
     )
     assert set(sections) <= set(Mission.model_fields)
+
+
+@pytest.mark.parametrize("n_drones", range(1, MAX_DRONES + 1))
+def test_a_new_file_of_any_allowed_number_of_drones_lacks_nothing_but_its_key(tmp_path, n_drones):
+    path = tmp_path / "fleet.toml"
+    assert podwatch("new", path, "--drones", n_drones).exit_code == 0
+    mission = read_fleet(path)
+    assert len(load_mission(path, SimMission).roster) == n_drones
+    assert [one.what for one in check.check_fleet(mission, path) if one.lacks] == ["key"]
 
 
 def test_a_file_that_is_there_is_never_overwritten(fleet):

@@ -4,6 +4,7 @@ __all__ = ["fleet_text"]
 
 RADIO_PORT = 14600
 HOME_SPACING_M = 10.0
+HOMES_IN_A_ROW = 10  # eastwards; the next row south of it, so that every home lies well inside the fence
 
 HEAD = """\
 # The fleet "{name}": the same file on every drone and on the boat.
@@ -39,7 +40,7 @@ fence_radius_m = 600.0       # of the circle round the origin
 battery_return = 0.25        # share of the charge at which a drone goes home
 battery_land = 0.10          # and at which it lands where it is
 
-[camera]                     # alike on every drone, looking straight down
+[camera]                     # alike on every drone, looking straight down, the top of the picture at the nose
 width_px = 640
 height_px = 480
 vfov_deg = 60.0              # vertical field of view, as calibrated
@@ -59,17 +60,23 @@ lost_return_s = 0.0          # silent for so long, the boat is lost and the flee
 
 DRONE = """
 [[drones]]
-id = {id}
-home_n_m = 0.0               # where it stands before take-off: 3 m or more from the others
+id = {id:<2}                      # its autopilot's MAV_SYSID too
+home_n_m = {home_n_m:<6.1f}            # where it stands before take-off: 3 m or more from the others
 home_e_m = {home_e_m:.1f}
 [drones.machine]
 radio = "10.76.0.{id}:{port}"    # where the others reach this drone
 autopilot = "serial:/dev/ttyAMA0:921600"  # or udp:HOST:PORT (listens), udpout:HOST:PORT, tcp:HOST:PORT
-camera = "v4l2:/dev/video0"  # or gstreamer:PIPELINE, ffmpeg:rtsp://..., pictures:FOLDER (on the bench)
+camera = "v4l2:/dev/video0"  # or ffmpeg:rtsp://..., pictures:FOLDER (bench), gstreamer:... (not pip's OpenCV)
 """
 
 
 def fleet_text(name: str, file: str, n_drones: int) -> str:
     """A fleet file of `n_drones` drones, ids from 1."""
-    drones = (DRONE.format(id=k + 1, home_e_m=HOME_SPACING_M * k, port=RADIO_PORT) for k in range(n_drones))
+    drones = (_drone(k) for k in range(n_drones))
     return HEAD.format(name=name, file=file, port=RADIO_PORT) + "".join(drones)
+
+
+def _drone(rank: int) -> str:
+    row, column = divmod(rank, HOMES_IN_A_ROW)
+    home = {"home_n_m": -HOME_SPACING_M * row or 0.0, "home_e_m": HOME_SPACING_M * column}
+    return DRONE.format(id=rank + 1, port=RADIO_PORT, **home)
