@@ -1,5 +1,5 @@
 """Pages of the docs made from the code: `python -m tools.docs` writes docs/processes.md, docs/channels.md and
-docs/mission.md.
+docs/mission.md, and the table of states in docs/navigator.md.
 
 A test compares the files with what this module makes, so that the docs say what the tables say.
 """
@@ -11,12 +11,32 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from lcmtypes.channels import CHANNELS
+from procs.navigator.states import State
 from procs.processes import PROCESSES
 from tools.docs_mission import mission_page
+from tools.report.words import state_words
 
 __all__ = ["PAGES", "channels_page", "processes_page"]
 
+FOLDER = Path(__file__).parent.parent / "docs"
 MADE = "<!-- made by `python -m tools.docs`; do not edit -->"
+STATES_BEGIN = "<!-- states: made by `python -m tools.docs`; do not edit -->"
+STATES_END = "<!-- end of states -->"
+DOES = {
+    State.IDLE: "stands, and waits for the mission, for an order, or for what it lacks",
+    State.TAKEOFF: "climbs straight up over its home",
+    State.SCOUT: "flies the spiral and looks for animals",
+    State.STANDBY: "waits in the air: over its home, or beside a pod that has an animal too few",
+    State.FOUND: "has animals in view, makes sure, and places itself over them",
+    State.RENDEZVOUS: "flies to its place on the circle over the pod",
+    State.REGISTER: "holds that place while the drones compare their views",
+    State.ASSIGN: "holds that place while the drones share out the animals",
+    State.MONITOR: "keeps its own animal in the middle of its picture",
+    State.RETURN: "flies to over its home",
+    State.LANDED: "is on the ground, its motors off",
+    State.HOLD: "stays where it is: ordered to, in doubt about position or autopilot, or with its pilot",
+    State.LAND: "comes down where it is",
+}
 
 
 def processes_page() -> str:
@@ -62,18 +82,28 @@ def channels_page() -> str:
     return "\n".join([*lines, ""])
 
 
+def navigator_page() -> str:
+    """docs/navigator.md with its table of states made anew: each with the report's word for it."""
+    page = (FOLDER / "navigator.md").read_text()
+    before, _, rest = page.partition(STATES_BEGIN)
+    _, _, after = rest.partition(STATES_END)
+    rows = [f"| {state.name} | {state_words(state.name)} | {DOES[state]} |" for state in State]
+    table = "\n".join(["| state | in the report | what the drone does |", "|---|---|---|", *rows])
+    return f"{before}{STATES_BEGIN}\n\n{table}\n\n{STATES_END}{after}"
+
+
 PAGES: dict[str, Callable[[], str]] = {
     "processes.md": processes_page,
     "channels.md": channels_page,
     "mission.md": partial(mission_page, MADE),
+    "navigator.md": navigator_page,
 }
 
 
 def main() -> None:
     """Write every page."""
-    folder = Path(__file__).parent.parent / "docs"
     for name, page in PAGES.items():
-        (folder / name).write_text(page())
+        (FOLDER / name).write_text(page())
 
 
 if __name__ == "__main__":
