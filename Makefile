@@ -1,14 +1,18 @@
-# Two commands: `make sim` flies the default mission, `make test` runs all that CI runs. Each makes what it needs first.
+# `make sim` flies the default mission, `make test` runs all that CI runs, `make install` is for a machine that flies or
+# for the boat: the environment with what flying needs. Each makes what it needs first.
 PYTHON ?= python3
 VENV := .venv
 FLIES := $(VENV)/.flies
 TESTS := $(VENV)/.tests
 SOURCES := pyproject.toml $(wildcard lcmtypes/*.lcm) lcmtypes/hatch_build.py tools/make_venv.sh
 
-.PHONY: sim test lint clean
+.PHONY: sim install test lint clean
 
 sim: $(FLIES)
 	$(VENV)/bin/podwatch sim
+
+install: $(FLIES)
+	@echo "installed: $(CURDIR)/$(VENV)/bin/podwatch"
 
 test: lint
 	$(VENV)/bin/python -m pytest -n 2 --dist worksteal

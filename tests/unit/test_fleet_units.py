@@ -8,12 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from typer.testing import CliRunner
 
 from procs import processes
 from procs.processes import PROCESSES, Restart
 from procs.relay.keys import make_key
 from procs.settings import DroneSettings
 from tools.buses import bus_url
+from tools.cli import app
 from tools.fleet import units
 from tools.fleet.machine import read_fleet
 from tools.fleet.template import fleet_text
@@ -154,3 +156,23 @@ def test_an_autopilot_over_the_network_may_use_it_and_no_device(mission, tmp_pat
     made = written(mission.model_copy(update={"drones": tuple(entries)}), tmp_path / "units")
     assert made["autopilot"].get("PrivateDevices") == "yes"
     assert made["autopilot"].get("IPAddressDeny") == ""
+
+
+def test_a_place_that_the_units_user_may_not_enter_is_told(mission, tmp_path, monkeypatch):
+    """tmp_path is its owner's alone, as a home is."""
+    closed = tmp_path / "closed"
+    (closed / "out").mkdir(parents=True, mode=0o755)
+    closed.chmod(0o700)
+    assert closed in units.closed_folders(closed / "out")
+    closed.chmod(0o755)
+    assert closed not in units.closed_folders(closed / "out")
+    monkeypatch.setattr(units, "ROOT", closed / "podwatch")
+    closed.chmod(0o700)
+    assert closed in units.closed_folders(tmp_path)
+    told = CliRunner().invoke(
+        app, ["fleet", "units", str(tmp_path / "fleet.toml"), "--drone", "2", "--out", str(closed / "out")]
+    )
+    assert told.exit_code == 0
+    assert f"the user podwatch may not enter {closed}," in told.stderr
+    assert "/opt/podwatch" in told.stderr
+    assert "sudo systemctl restart podwatch-2.target" in told.stdout

@@ -32,12 +32,12 @@ def restored_model(root: Path | None = None) -> str:
     """
     root = root or Path(models.__file__).parents[1]
     if (root / ".git").exists():
-        return f"git -C {shlex.quote(str(root))} checkout models/{SHIPPED}"
-    again = f"{shlex.quote(sys.executable)} -m pip install --force-reinstall --no-deps"
-    source = _installed_from()
-    if source:
-        return f"{again} {shlex.quote(source)}"
-    return f"{again} PATH  # of podwatch's folder or wheel"
+        command = f"git -C {shlex.quote(str(root))} checkout models/{SHIPPED}"
+    else:
+        source = _installed_from()
+        place = shlex.quote(source) if source else "PATH  # of podwatch's folder or wheel"
+        command = f"{shlex.quote(sys.executable)} -m pip install --force-reinstall --no-deps {place}"
+    return command if os.access(root, os.W_OK) else as_root(command)
 
 
 def _installed_from() -> str:

@@ -106,11 +106,19 @@ def units(
 ) -> None:
     """Write the systemd units of one drone, and the settings that they name."""
     from tools.fleet.machine import read_fleet
-    from tools.fleet.units import write_units
+    from tools.fleet.units import USER, closed_folders, write_units
 
     with plain_errors():
         files = write_units(read_fleet(path), drone, out)
+    for folder in closed_folders(out):
+        typer.echo(
+            f"podwatch: the user {USER} may not enter {folder}, where the units look for their files: clone "
+            "podwatch to /opt/podwatch, with the system's python3, and write the units to /etc/podwatch",
+            err=True,
+        )
+    target = f"podwatch-{drone}.target"
     typer.echo(
-        f"{len(files)} files in {out}. On the drone, once: sudo useradd -r podwatch; then: sudo systemctl "
-        f"link {out.resolve()}/podwatch-{drone}*; sudo systemctl enable --now podwatch-{drone}.target"
+        f"{len(files)} files in {out}. On the drone, once: sudo useradd -r {USER}; then: sudo systemctl "
+        f"link {out.resolve()}/podwatch-{drone}*; sudo systemctl enable --now {target}. After every change "
+        f"of the fleet file this again, then: sudo systemctl daemon-reload; sudo systemctl restart {target}"
     )

@@ -7,6 +7,7 @@ stop later is started before: systemd stops units against the order of After=.
 """
 
 import os
+import stat
 import sys
 from pathlib import Path
 
@@ -17,8 +18,9 @@ from tools.buses import bus_url
 from tools.doctor.machine import RECEIVE_BYTES
 from tools.fleet.machine import drone_settings, machine_of
 
-__all__ = ["STATE_FOLDER", "unit_name", "write_units"]
+__all__ = ["STATE_FOLDER", "closed_folders", "unit_name", "write_units"]
 
+ROOT = Path(__file__).resolve().parents[2]
 USER = "podwatch"
 STATE_FOLDER = Path("/var/lib/podwatch")
 STOP_WAIT_S = 6
@@ -58,6 +60,14 @@ BUS_ONLY = "IPAddressDeny=any\nIPAddressAllow=localhost multicast\n"
 def unit_name(drone_id: int, process: str) -> str:
     """ "podwatch-3-relay.service"."""
     return f"podwatch-{drone_id}-{process}.service"
+
+
+def closed_folders(out: Path) -> list[Path]:
+    """Folders on the way to what the units start and read that others than their owner may not enter."""
+    python = Path(sys.executable)
+    ways = [path.absolute() for path in (out / "settings", ROOT / "procs", python, python.resolve())]
+    folders = dict.fromkeys(folder for way in ways for folder in reversed(way.parents))
+    return [folder for folder in folders if not folder.stat().st_mode & stat.S_IXOTH]
 
 
 def write_units(mission: Mission, drone_id: int, out: Path) -> list[Path]:
@@ -125,7 +135,6 @@ def _unit_text(process: Process, drone_id: int, machine: MachineSettings, settin
     net = unit_name(drone_id, NET)
     after = " ".join(["network.target", net, *later])
     restart = "always" if process.restart_air is Restart.ALWAYS else "no"
-    root = Path(__file__).resolve().parents[2]
     return (
         f"[Unit]\n"
         f"Description=podwatch {process.name} of drone {drone_id}\n"
@@ -137,7 +146,7 @@ def _unit_text(process: Process, drone_id: int, machine: MachineSettings, settin
         f"Type=notify\n"
         f"NotifyAccess=main\n"
         f"ExecStart={_quoted(sys.executable)} -m procs.main {process.name} {_quoted(settings)}\n"
-        f"WorkingDirectory={_plain(root)}\n"
+        f"WorkingDirectory={_plain(ROOT)}\n"
         f"User={USER}\n"
         f"Environment=OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1\n"
         f"Restart={restart}\n"
