@@ -166,7 +166,7 @@ def test_a_place_that_the_units_user_may_not_enter_is_told(mission, tmp_path, mo
     assert closed in units.closed_folders(closed / "out")
     closed.chmod(0o755)
     assert closed not in units.closed_folders(closed / "out")
-    monkeypatch.setattr(units, "ROOT", closed / "podwatch")
+    monkeypatch.setattr(units, "ROOT", closed / "out")
     closed.chmod(0o700)
     assert closed in units.closed_folders(tmp_path)
     told = CliRunner().invoke(
