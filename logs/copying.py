@@ -11,7 +11,7 @@ from pathlib import Path
 from logs.exceptions import LogError
 from logs.reader import info
 from logs.scan import RawMessage, Scan
-from logs.writer import METADATA, LogWriter
+from logs.writer import BOOT, METADATA, LogWriter
 
 __all__ = ["Copied", "copy_message", "merge", "open_like", "recover", "split"]
 
@@ -77,7 +77,7 @@ def split(path: Path, folder: Path, every_s: float, report: Report) -> list[Copi
 def merge(paths: Sequence[Path], out: Path, report: Report) -> Copied:
     """Join logs of one drone into one, in the order of their log times.
 
-    Raises LogError: no log, logs of several drones (each has a clock of its own), `out` exists.
+    Raises LogError: no log, logs of several drones or boots (each has a clock of its own), `out` exists.
     """
     scans = [Scan(path, report) for path in paths]
     streams = [_started(scan) for scan in scans]
@@ -90,7 +90,18 @@ def merge(paths: Sequence[Path], out: Path, report: Report) -> Copied:
             f"these are logs of several drones, each on a clock of its own: {told}; merge the logs of "
             "one, or play several as a fleet with podwatch play"
         )
+    _refuse_boots(scans)
     return _write(open_like(scans[0], out), [], heapq.merge(*streams, key=_log_time))
+
+
+def _refuse_boots(scans: Sequence[Scan]) -> None:
+    boots = {boot: scan.path for scan in scans if (boot := scan.metadata.get(METADATA, {}).get(BOOT, ""))}
+    if len(boots) > 1:
+        told = ", ".join(f"{path} of boot {boot}" for boot, path in boots.items())
+        raise LogError(
+            f"these are logs of several boots of a drone, each on a clock of its own: {told}; merge those of "
+            "one"
+        )
 
 
 def open_like(scan: Scan, out: Path) -> LogWriter:

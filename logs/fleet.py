@@ -16,14 +16,24 @@ from statistics import median
 from typing import NamedTuple
 
 from lcmtypes import channels
-from lcmtypes.podwatch import fleet_state_t, link_state_t
+from lcmtypes.podwatch import fleet_state_t
+from logs.boots import boots, pictures, segments
 from logs.exceptions import LogError
-from logs.reader import pictures, segments
+from logs.missions import Samples, agreeing, distinct, link_offsets, missions, report_strays
 from logs.scan import RawMessage, Scan
 from logs.sequence import read_head
 from logs.writer import METADATA
 
-__all__ = ["DroneLog", "Fleet", "FleetMessage", "Line", "find_logs", "fit_line", "measure_clocks"]
+__all__ = [
+    "DroneLog",
+    "Fleet",
+    "FleetMessage",
+    "Line",
+    "find_logs",
+    "fit_line",
+    "list_logs",
+    "measure_clocks",
+]
 
 Report = Callable[[str], None]
 
@@ -61,15 +71,17 @@ class Line:
 
 
 class DroneLog:
-    """Everything that one drone logged: its log, the files that go on behind it, its pictures.
+    """Everything that one drone logged in one boot: its log, the files that go on behind it, its pictures.
 
-    Raises LogError: no log, or one that does not say whose it is.
+    `report` is told of files beside it that are of other boots. Raises LogError: no log, or one that does not
+    say whose it is.
     """
 
     def __init__(self, path: Path, report: Report) -> None:
         self.path = path
         self._report = report
-        self.paths = [*segments(path), *pictures(path)]
+        self._logged, self._shown = segments(path), pictures(path)
+        self.paths = [*self._logged, *self._shown]
         first = Scan(self.paths[0], report)
         for _ in first.messages():  # the metadata stands before the first message
             break
@@ -78,11 +90,17 @@ class DroneLog:
         if not drone_id.isdigit():
             raise LogError(f"{path}: does not say whose log it is; make it anew with podwatch log from-lcm")
         self.drone_id = int(drone_id)
+        for files in boots(path)[1:]:
+            report(
+                f"{path}: {', '.join(file.name for file in files)} beside it is of another boot of drone "
+                f"{drone_id}, on a clock of its own, and not part of this log"
+            )
+        report_strays(path, report)
 
     def messages(self) -> Iterator[RawMessage]:
         """Every whole message by log time."""
-        logged = chain.from_iterable(Scan(path, self._report).messages() for path in segments(self.path))
-        shown = chain.from_iterable(Scan(path, self._report).messages() for path in pictures(self.path))
+        logged = chain.from_iterable(Scan(path, self._report).messages() for path in self._logged)
+        shown = chain.from_iterable(Scan(path, self._report).messages() for path in self._shown)
         return heapq.merge(logged, shown, key=lambda raw: raw.log_time_ns)
 
 
@@ -115,8 +133,8 @@ class Fleet:
             yield FleetMessage(round(line.at(raw.log_time_ns / 1000)), log.drone_id, raw)
 
 
-def find_logs(paths: Iterable[Path]) -> list[Path]:
-    """The logs that people mean: files as they are, of a run's folder each drone's log.
+def list_logs(paths: Iterable[Path]) -> list[Path]:
+    """The logs that people mean: files as they are, of a run's folder each drone's log; one a boot.
 
     Raises LogError for a folder without one.
     """
@@ -129,26 +147,40 @@ def find_logs(paths: Iterable[Path]) -> list[Path]:
         drones = sorted(path / f"{stem}.mcap" for stem in {name[1] for name in names if name})
         if not drones:
             raise LogError(f"{path}: no drone_<id>.mcap in this folder; give a run's folder, or logs")
-        found += drones
-    return found
+        for log in drones:
+            found += [log, *(files[0] for files in boots(log)[1:])]
+    return distinct(found)
+
+
+def find_logs(paths: Iterable[Path]) -> list[Path]:
+    """The logs of the one mission that people mean, as `list_logs` finds them.
+
+    Raises LogError for a folder without one, and for the logs of several missions.
+    """
+    found = missions(list_logs(paths), lambda _text: None)
+    if len(found) > 1:
+        told = "; or: ".join(" ".join(str(log) for log in logs) for logs in found)
+        raise LogError(
+            f"these are {len(found)} missions, as a drone's clock begins anew at each boot of its computer; "
+            f"give the logs of one: {told}"
+        )
+    return found[0]
 
 
 def measure_clocks(log: DroneLog) -> dict[int, Line]:
     """Each other drone's clock by this one's, as measured in flight: LINK_STATE's, else FLEET_STATE's."""
-    by_link: dict[int, list[tuple[int, int]]] = defaultdict(list)
-    by_fleet: dict[int, list[tuple[int, int]]] = defaultdict(list)
+    return {peer: fit_line(samples) for peer, samples in _offsets(log).items()}
+
+
+def _offsets(log: DroneLog) -> dict[int, Samples]:
+    by_fleet: dict[int, Samples] = defaultdict(list)
     for raw in log.messages():
-        if raw.channel == channels.LINK_STATE and read_head(raw.channel, raw.data):
-            links = link_state_t.decode(raw.data)
-            for link in links.links:
-                if link.up and link.offset_us:
-                    by_link[link.peer_id].append((links.utime, link.offset_us))
-        elif raw.channel == channels.FLEET_STATE and read_head(raw.channel, raw.data):
+        if raw.channel == channels.FLEET_STATE and read_head(raw.channel, raw.data):
             state = fleet_state_t.decode(raw.data)
             living = [row.id for row in state.rows if row.alive and row.id > 0]
             if state.fleet_time_ok and living and min(living) != state.drone_id:
                 by_fleet[min(living)].append((state.utime, state.fleet_offset_us))
-    return {peer: fit_line(samples) for peer, samples in {**by_fleet, **by_link}.items()}
+    return {**by_fleet, **link_offsets(log.messages())}
 
 
 def fit_line(samples: Sequence[tuple[int, int]]) -> Line:
@@ -178,8 +210,12 @@ def _least_squares(samples: Sequence[tuple[int, int]]) -> tuple[float, float, fl
 def _clock_lines(logs: Sequence[DroneLog]) -> dict[int, Line]:
     """The line from each drone's clock to the lowest one's, by as few links as possible."""
     to_peer: dict[int, dict[int, Line]] = {log.drone_id: {} for log in logs}
+    offsets = {log.drone_id: _offsets(log) for log in logs}
     for log in logs:
-        for peer, line in measure_clocks(log).items():
+        for peer, samples in offsets[log.drone_id].items():
+            # A peer that began anew had another clock then: what its log tells of too is of this one.
+            agreed = agreeing(samples, offsets.get(peer, {}).get(log.drone_id, []))
+            line = fit_line(agreed or samples)
             to_peer[log.drone_id][peer] = line
             to_peer.setdefault(peer, {}).setdefault(log.drone_id, line.inverse())
     reference = min(log.drone_id for log in logs)

@@ -3,7 +3,6 @@
 Any damage is survived: what is whole is read, what is not gets one LogWarning that says what is missing.
 """
 
-import glob
 import os
 import struct
 import warnings
@@ -14,11 +13,12 @@ from typing import Any
 
 from lcmtypes import channels as table
 from lcmtypes import podwatch
+from logs.boots import pictures, segments
 from logs.exceptions import LogError, LogWarning
 from logs.scan import RawMessage, Scan
 from logs.schemas import PACKAGE, fingerprint
 from logs.sequence import GapCounter
-from logs.writer import METADATA, picture_path
+from logs.writer import METADATA
 
 __all__ = ["ChannelInfo", "LogInfo", "info", "pictures", "read", "segments"]
 
@@ -95,27 +95,6 @@ def info(path: PathLike) -> LogInfo:
         closed=scan.closed,
         problems=tuple(problems),
     )
-
-
-def segments(path: PathLike) -> list[Path]:
-    """The files of one log in their order: `path` and what goes on behind it, name.1.mcap, name.2.mcap, ...
-
-    A logger that was restarted, or that begins a new file now and then, numbers them on; the oldest may have
-    been dropped for room. `path` alone where there are none.
-    """
-    first = Path(path)
-    numbered = {0: first} if first.exists() else {}
-    for other in first.parent.glob(f"{glob.escape(first.stem)}.*{first.suffix}"):
-        number = other.stem.removeprefix(f"{first.stem}.")
-        if number.isdigit():
-            numbered[int(number)] = other
-    return [numbered[number] for number in sorted(numbered)] or [first]
-
-
-def pictures(path: PathLike) -> list[Path]:
-    """The files beside a log that hold its drone's pictures, where its logger kept them apart."""
-    first = Path(path)
-    return [found for found in segments(picture_path(first)) if found.exists()]
 
 
 class _Tally:

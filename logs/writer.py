@@ -14,10 +14,11 @@ from logs.exceptions import LogError
 from logs.schemas import fingerprint, lcm_text, type_name
 from logs.sequence import read_head
 
-__all__ = ["ENCODING", "FLUSH_PERIOD_US", "METADATA", "LogWriter", "fresh_path", "picture_path"]
+__all__ = ["BOOT", "ENCODING", "FLUSH_PERIOD_US", "METADATA", "LogWriter", "fresh_path", "picture_path"]
 
 ENCODING = "lcm"  # of messages and of schemas
 METADATA = "podwatch"  # name of the MCAP metadata record that tells whose log it is
+BOOT = "boot"  # its key for the start of the drone's computer from which the log's times count
 LIBRARY = "podwatch"  # no version: the same messages give the same bytes
 FLUSH_PERIOD_US = 1_000_000  # a killed logger loses at most this much
 CHUNK_BYTES = 4 * 1024 * 1024  # a chunk is closed by time long before

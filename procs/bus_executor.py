@@ -95,6 +95,10 @@ class BusRuntime(Runtime):
     def elapsed_us(self) -> int:
         return int(self._clock.utime()) - self._now
 
+    @property
+    def boot(self) -> str:
+        return str(getattr(self._clock, "boot", ""))
+
     def open(self, name: str) -> Any:
         spec = self.settings.drivers.get(name)
         if spec is None:

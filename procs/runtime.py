@@ -92,6 +92,11 @@ class Runtime(ABC):
         """The drone's clock, us: the instant at which the running handler began."""
 
     @property
+    def boot(self) -> str:
+        """Since which start of this computer `utime` counts, "" where the clock does not say (virtual time)."""
+        return ""
+
+    @property
     @abstractmethod
     def elapsed_us(self) -> int:
         """How long the running handler has taken so far, us (its nominal time on the virtual clock)."""

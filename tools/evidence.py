@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 
 from drivers.cameras.pinhole import Pinhole
 from lcmtypes import channels
+from logs.boots import other_boots, pictures, segments
 from logs.exceptions import LogError
-from logs.reader import pictures, read, segments
+from logs.reader import read
 from procs.navigator.states import State
 
 __all__ = [
@@ -182,6 +183,11 @@ def load_run(folder: Path) -> Run:
         samples, complaints = read_samples([*segments(log), *pictures(log)], drone_id, clocks[drone_id])
         messages[drone_id] = samples
         problems += complaints
+        problems += [
+            f"drone {drone_id}: {', '.join(file.name for file in files)} is of another flight, on a clock "
+            "of its own, and is left out"
+            for files in other_boots(log)
+        ]
         logs.append(drone_log(drone_id, samples, camera))
     return Run(folder, about, mission, truth, tuple(logs), messages, clocks, tuple(problems))
 

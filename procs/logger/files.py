@@ -8,7 +8,7 @@ what is being written stays.
 from collections.abc import Mapping
 from pathlib import Path
 
-from logs.reader import segments
+from logs.boots import numbered
 from logs.writer import LogWriter, fresh_path, picture_path
 from procs.settings import LogSettings
 
@@ -68,7 +68,7 @@ class SegmentedLog:
     def closed_files(self) -> list[Path]:
         """Every file of this log but the one that is written, oldest first."""
         current = self._writer.path if self._writer else None
-        return [path for path in segments(self._base) if path != current and path.exists()]
+        return [path for path in numbered(self._base) if path != current and path.exists()]
 
 
 class LogFiles:

@@ -14,6 +14,7 @@ from lcmtypes import channels, make
 from lcmtypes.podwatch import frame_t, log_state_t, preview_t
 from logs.exceptions import LogError
 from logs.sequence import GapCounter, read_head
+from logs.writer import BOOT
 from procs.logger.files import LogFiles
 from procs.logger.selection import Selection, disk_is_full, disk_trouble
 from procs.runtime import Runtime, RuntimeFailure
@@ -134,6 +135,8 @@ class Logger:
             "mission": settings.mission.model_dump_json(),
             "seed": str(settings.seed),
         }
+        if self._runtime.boot:
+            metadata[BOOT] = self._runtime.boot
         try:
             self._path.parent.mkdir(parents=True, exist_ok=True)
             files = LogFiles(self._path, self._runtime.drone_id, metadata, settings.mission.log)

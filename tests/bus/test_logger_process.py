@@ -11,7 +11,7 @@ from pathlib import Path
 import lcm
 import pytest
 
-from drivers.clocks.monotonic import MonotonicClock
+from drivers.clocks.monotonic import BOOT_ID, MonotonicClock
 from lcmtypes import channels, make, podwatch
 from logs.reader import info, read, segments
 from procs.settings import DroneSettings, Mission
@@ -99,6 +99,7 @@ def test_a_killed_logger_leaves_a_log_up_to_its_last_second_and_its_successor_go
     _, successor = segments(drone.log)
     log = info(successor)
     assert (log.closed, log.problems) == (True, ())
+    assert log.metadata["boot"] == BOOT_ID.read_text().strip()
     assert {channel.name: channel.n_lost for channel in log.channels} == {
         "HEARTBEAT": 0,
         "LOG_STATE": 0,

@@ -53,7 +53,16 @@ def test_info_names_the_files_of_a_restarted_logger(log, tmp_path):
     first = tmp_path / "drone3.mcap"
     first.write_bytes(log.read_bytes())
     (tmp_path / "drone3.1.mcap").write_bytes(log.read_bytes())
-    assert f"the log goes on in {tmp_path / 'drone3.1.mcap'}" in run("info", first).stdout
+    said = run("info", first).stdout
+    assert (
+        f"of another boot, on a clock of its own, and no part of this log: {tmp_path / 'drone3.1.mcap'}"
+        in said
+    )
+    writer = LogWriter(tmp_path / "drone3.2.mcap", drone_id=3)
+    writer.write(channels.TRACK, podwatch.track_t().encode(), 5_900_000)
+    writer.close()
+    (tmp_path / "drone3.1.mcap").unlink()
+    assert f"the log goes on in {tmp_path / 'drone3.2.mcap'}" in run("info", first).stdout
 
 
 def test_cat_prints_a_message_a_line_from_the_logs_start(log):

@@ -130,8 +130,8 @@ def test_span_filter_and_new_names():
 
 @pytest.mark.parametrize("channel", [channels.FRAME, channels.IMAGE])
 def test_handles_and_whole_images_are_never_said(channel):
-    _, bus, _ = play(messages([0, 1], channel))
-    assert bus.said == []
+    _, bus, _ = play([*messages([0, 1], channel), *messages([2])])
+    assert [said for _, said, _ in bus.said] == [channels.TRACK]
 
 
 @pytest.mark.parametrize("pair", ["TRACK", "=NEW", "TRACK=", "TRACK=" + "X" * 64])

@@ -4,6 +4,7 @@ code.
 
 import json
 import re
+import shutil
 from pathlib import Path
 
 import cv2
@@ -314,7 +315,7 @@ def test_words_from_logs_and_missions_cannot_become_code(tmp_path: Path) -> None
     folder = HostileRun(duration_s=20, monitor_s=(5, 15)).write(tmp_path / "<img src=x onerror=alert(3)>")
     (folder / "mission.json").write_text(json.dumps({"name": HOSTILE}))
     writer = LogWriter(folder / "drone_1.1.mcap", drone_id=1)
-    for utime in (12_000_000, 16_000_000):
+    for utime in (22_000_000, 26_000_000):
         beat = make(podwatch.heartbeat_t, utime=utime, process=HOSTILE, status=2, detail=HOSTILE)
         writer.write(channels.HEARTBEAT, beat.encode(), utime)
     writer.close()
@@ -331,7 +332,7 @@ def test_words_from_logs_and_missions_cannot_become_code(tmp_path: Path) -> None
 def test_a_day_of_two_missions_begins_with_what_each_came_to(tmp_path: Path) -> None:
     good = MappedRun(duration_s=20, monitor_s=(5, 15)).write(tmp_path / "day" / "2026-05-01_09-30-00")
     MappedRun(duration_s=20, monitor_s=(50, 60)).write(tmp_path / "day" / "2026-05-01_14-05-00")
-    flights = [read_flight(paths) for paths in find_flights([tmp_path / "day"])]
+    flights = [read_flight(paths) for paths in find_flights([tmp_path / "day"], pytest.fail)]
     page = write_report(flights, tmp_path / "report.html").read_text(encoding="utf-8")
     words = words_of(page)
     assert "Two missions: one went well, one did not." in words
@@ -349,14 +350,46 @@ def test_a_day_of_two_missions_begins_with_what_each_came_to(tmp_path: Path) -> 
 
 def test_what_people_give_is_missions_in_their_order(tmp_path: Path, alone: Path, folder: Path) -> None:
     logs = [alone / "drone_1.mcap", alone / "drone_2.mcap"]
-    assert find_flights([folder, *logs]) == [[folder], logs]
+    assert find_flights([folder, *logs], pytest.fail) == [[folder], logs]
     assert [log.id for log in read_flight(logs).run.drones] == [1, 2]
     with pytest.raises(LogError, match=r"no drone_<id>\.mcap in this folder, nor in one of its folders"):
-        find_flights([tmp_path])
+        find_flights([tmp_path], pytest.fail)
     with pytest.raises(LogError, match="no such file or folder"):
-        find_flights([tmp_path / "gone.mcap"])
+        find_flights([tmp_path / "gone.mcap"], pytest.fail)
     with pytest.raises(LogError, match="are both of drone 1"):
         read_flight([alone / "drone_1.mcap", folder / "drone_1.mcap"])
+
+
+def test_two_boots_of_the_drones_in_one_folder_are_two_missions_of_a_day(tmp_path: Path) -> None:
+    """As a service leaves them: its second boot goes on under the first one's names, on clocks of its own."""
+    first = {1: Clock(3e6), 2: Clock(900e6)}
+    second = {1: Clock(5e6), 2: Clock(70e6)}
+    kept = logs_only(tmp_path / "kept", MappedRun(n_drones=2, duration_s=20, clocks=first))
+    later = logs_only(tmp_path / "later", MappedRun(n_drones=2, duration_s=30, clocks=second))
+    for drone in (1, 2):
+        (later / f"drone_{drone}.mcap").rename(kept / f"drone_{drone}.1.mcap")
+    found = find_flights([kept], pytest.fail)
+    assert [[path.name for path in paths] for paths in found] == [
+        ["drone_1.mcap", "drone_2.mcap"],
+        ["drone_1.1.mcap", "drone_2.1.mcap"],
+    ]
+    flights = [read_flight(paths) for paths in found]
+    assert [round(flight.end_s) for flight in flights] == [20, 30]
+    assert [flight.run.problems for flight in flights] == [(), ()]
+    result = CliRunner().invoke(app, ["report", str(kept)])
+    assert result.exit_code == 0, result.output
+    assert result.stdout.strip() == str(kept / "report.html")
+    assert "Two missions:" in words_of((kept / "report.html").read_text(encoding="utf-8"))
+
+
+def test_another_flights_log_in_a_runs_folder_is_left_out_and_told(tmp_path: Path, folder: Path) -> None:
+    run = shutil.copytree(folder, tmp_path / "run")
+    shutil.copy(run / "drone_1.mcap", run / "drone_1.1.mcap")
+    [flight] = [read_flight(paths) for paths in find_flights([run], pytest.fail)]
+    assert flight.run.problems == (
+        "drone 1: drone_1.1.mcap is of another flight, on a clock of its own, and is left out",
+    )
+    assert len(flight.run.messages[1][channels.TRACK]) == len(load_run(folder).messages[1][channels.TRACK])
 
 
 def test_the_command_writes_the_page_and_a_runs_summary(tmp_path: Path) -> None:

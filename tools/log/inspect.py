@@ -8,9 +8,11 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from logs.boots import other_boots, pictures, segments
 from logs.exceptions import LogError
-from logs.reader import LogInfo, info, pictures, read, segments
+from logs.reader import LogInfo, info, read
 from logs.schemas import PACKAGE
+from logs.writer import BOOT
 from tools.log.shared import LogPath, app, clear_errors, size_text, warn
 
 __all__ = ["describe", "describe_value"]
@@ -92,9 +94,14 @@ def _summary(log: LogInfo) -> str:
         f"{'closed' if log.closed else 'NOT closed'}",
         f"drone clock {log.start_ns / 1e9:.6f} s to {log.end_ns / 1e9:.6f} s",
     ]
+    if log.metadata.get(BOOT):
+        lines.append(f"boot {log.metadata[BOOT]}")
     others = [str(segment) for segment in segments(log.path) if segment != log.path]
     if others:
         lines.append(f"the log goes on in {', '.join(others)}")
+    for files in other_boots(log.path):
+        told = ", ".join(map(str, files))
+        lines.append(f"of another boot, on a clock of its own, and no part of this log: {told}")
     apart = [str(path) for path in pictures(log.path)]
     if apart:
         lines.append(f"its pictures are in {', '.join(apart)}")

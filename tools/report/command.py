@@ -19,7 +19,8 @@ def report(
         list[Path],
         typer.Argument(
             metavar="RUN-or-LOGS...",
-            help="Runs' folders, a folder of them for a day, or drones' logs of one mission.",
+            help="Runs' folders, a folder of them for a day, or drones' logs of one mission. Logs of several "
+            "boots of a drone are as many missions.",
             show_default=False,
         ),
     ],
@@ -37,9 +38,9 @@ def report(
     from tools.report.page import write_report
 
     with plain_errors():
-        found = find_flights(paths)
+        found = find_flights(paths, lambda text: typer.echo(f"podwatch: {text}", err=True))
         flights = _readable(found)
-        page = write_report(flights, out or _beside(found))
+        page = write_report(flights, out or _beside(found, has_folder=any(path.is_dir() for path in paths)))
         for flight in flights:
             if flight.knows_drones:
                 text = json.dumps(flight.summary, indent=2, allow_nan=False) + "\n"
@@ -66,9 +67,9 @@ def _readable(found: list[list[Path]]) -> list["Flight"]:
     return flights
 
 
-def _beside(found: list[list[Path]]) -> Path:
+def _beside(found: list[list[Path]], *, has_folder: bool) -> Path:
     """In the one mission's folder, that of its logs too; in the current folder where there are several."""
     folders = {path if path.is_dir() else path.parent for paths in found for path in paths}
     # A few logs by name tell less than their run's own page, which stays as it is.
-    name = "report.html" if any(path.is_dir() for paths in found for path in paths) else "logs_report.html"
+    name = "report.html" if has_folder else "logs_report.html"
     return (folders.pop() if len(folders) == 1 else Path()) / name

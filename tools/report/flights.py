@@ -17,7 +17,8 @@ import numpy as np
 from drivers.cameras.pinhole import Pinhole
 from logs.exceptions import LogError
 from logs.fleet import DroneLog as LogFiles
-from logs.fleet import Fleet, Line, find_logs
+from logs.fleet import Fleet, Line, find_logs, list_logs
+from logs.missions import missions
 from tools.evidence import Clock, EvidenceError, Run, Truth, drone_log, load_run, read_samples
 from tools.judge import Verdict, judge
 from tools.summary import summary_of
@@ -52,11 +53,13 @@ class Flight:
         return str(self.run.mission.get("name") or "mission")[:LONGEST_NAME]
 
 
-def find_flights(paths: Sequence[Path]) -> list[list[Path]]:
+def find_flights(paths: Sequence[Path], report: Callable[[str], None]) -> list[list[Path]]:
     """What people give, as one list of paths a mission, in the given order.
 
     A folder with drones' logs is a mission; one without is a day, and each of its folders with logs a
-    mission. All logs that are given by name fly together. Raises LogError where nothing is found.
+    mission. All logs that are given by name fly together. Where a drone's computer was started anew, so that
+    it has logs of several clocks, the logs are as many missions, by who was in contact with whom; `report`
+    gets a line where that leaves doubt. Raises LogError where nothing is found.
     """
     flights: list[list[Path]] = []
     loose: list[Path] = []
@@ -77,23 +80,36 @@ def find_flights(paths: Sequence[Path]) -> list[list[Path]]:
                     "folder, or drones' logs"
                 )
             flights += inner
-    return flights
+    return [mission for given in flights for mission in _missions(given, report)]
+
+
+def _missions(given: list[Path], report: Callable[[str], None]) -> list[list[Path]]:
+    """Logs that are given together as missions: as they are, but for logs of several clocks."""
+    if _is_simulated(given[0]):
+        return [given]
+    found = missions(list_logs(given), report)
+    return found if len(found) > 1 else [given]
 
 
 def read_flight(paths: list[Path]) -> Flight:
     """One mission, of one of `find_flights`' lists. Raises LogError where no log of it can be read at all."""
     folder = paths[0]
     trouble: list[str] = []
-    if folder.is_dir() and ((folder / "truth.json").exists() or (folder / "truth.mcap").exists()):
+    if _is_simulated(folder):
         try:
             run = load_run(folder)
         except EvidenceError as error:
             trouble = [f"{error}; the page tells what the drones' own logs say"]
         else:
             return _flight(_name(folder), run, knows_drones=True, knows_animals=run.truth.is_labelled)
-    run, cut_short = _read_logs(find_logs(paths), trouble)
+    run, cut_short = _read_logs(find_logs(paths) if trouble else list_logs(paths), trouble)
     name = _name(folder) if len(paths) == 1 else ", ".join(path.stem for path in paths)
     return replace(_flight(name, run, knows_drones=False, knows_animals=False), cut_short=cut_short)
+
+
+def _is_simulated(path: Path) -> bool:
+    """A folder that the simulator wrote."""
+    return path.is_dir() and ((path / "truth.json").exists() or (path / "truth.mcap").exists())
 
 
 def _flight(name: str, run: Run, *, knows_drones: bool, knows_animals: bool) -> Flight:
@@ -105,7 +121,7 @@ def _has_logs(folder: Path) -> bool:
     if (folder / "truth.json").exists():
         return True
     try:
-        return bool(find_logs([folder]))
+        return bool(list_logs([folder]))
     except LogError:
         return False
 
