@@ -27,7 +27,7 @@ def play(
     ],
     speed: Annotated[float, typer.Option(help="Seconds of the log a second.")] = 1.0,
     start: Annotated[float, typer.Option(help="First second, counted from the logs' first message.")] = 0.0,
-    end: Annotated[float | None, typer.Option(help="Last second. [default: the logs' end]")] = None,
+    end: Annotated[float | None, typer.Option(help="Last second.", show_default="the logs' end")] = None,
     loop: Annotated[bool, typer.Option("--loop", help="Begin anew at the end.")] = False,
     pause: Annotated[bool, typer.Option("--pause", help="Begin paused; a key goes on.")] = False,
     channel: Annotated[
@@ -39,7 +39,7 @@ def play(
         bool, typer.Option("--frames", help="Turn logged pictures into camera frames again.")
     ] = False,
     slot: Annotated[
-        int | None, typer.Option(min=0, max=49, help="The buses' slot. [default: the lowest free one]")
+        int | None, typer.Option(min=0, max=49, help="The buses' slot.", show_default="the lowest free one")
     ] = None,
     bus: Annotated[str | None, typer.Option(help="One LCM address for everything, udpm://...")] = None,
 ) -> None:

@@ -28,12 +28,20 @@ def replay_command(
     time_ms: Annotated[
         float | None,
         typer.Option(
-            "--time-tolerance", min=0, help="ms between two times. [default: 0; 100 for a log of real time]"
+            "--time-tolerance",
+            min=0,
+            help="ms between two times.",
+            show_default=f"0; {REAL_TIME_MS:g} for a log of real time",
         ),
     ] = None,
     relative: Annotated[
         float | None,
-        typer.Option("--tolerance", min=0, help="Share of a number. [default: 0; 0.01 for real time]"),
+        typer.Option(
+            "--tolerance",
+            min=0,
+            help="Share of a number.",
+            show_default=f"0; {REAL_RELATIVE:g} for a log of real time",
+        ),
     ] = None,
     show: Annotated[int, typer.Option(min=0, help="Differences to list.")] = SHOWN,
 ) -> None:

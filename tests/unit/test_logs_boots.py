@@ -17,7 +17,7 @@ SECOND_US = 1_000_000
 
 
 def write(path, boot, seconds, links=(), drone_id=1):
-    """TRACK and LINK_STATE at each of `seconds` of the drone's clock. links: (peer, offset, first, last), s."""
+    """TRACK and LINK_STATE at each of `seconds` of the drone's clock. links: peer, offset, first, last."""
     writer = LogWriter(path, drone_id=drone_id, metadata={BOOT: boot} if boot else {})
     for second in seconds:
         utime = second * SECOND_US

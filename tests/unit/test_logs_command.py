@@ -5,6 +5,7 @@ from typer.testing import CliRunner
 
 from lcmtypes import channels, make, podwatch
 from logs.writer import LogWriter
+from tools import cli
 from tools.log import app, describe
 
 
@@ -80,6 +81,7 @@ def test_cat_prints_a_message_a_line_from_the_logs_start(log):
     ("options", "times"),
     [
         (["-c", "FLEET_STATE"], [0.3, 0.6]),
+        (["-c", "*_STATE"], [0.3, 0.6]),
         (["--channel", "FLEET_STATE", "--channel", "TRACK", "--limit", "5"], [0.0, 0.1, 0.2, 0.3, 0.3]),
         (["--start", "0.65", "--end", "0.85"], [0.7, 0.8]),
         (["-c", "FLEET_STATE", "--start", "0.6"], [0.6]),
@@ -93,9 +95,19 @@ def test_cat_keeps_what_is_asked_for(log, options, times):
 
 
 def test_a_channel_that_the_log_lacks_is_told(log):
-    result = run("cat", log, "-c", "TRACKS")
-    assert result.stdout == ""
-    assert result.stderr == f"warning: {log}: has no channel TRACKS; it has FLEET_STATE, TRACK\n"
+    result = run("cat", log, "-c", "TRACK", "-c", "RX_*")
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert result.stderr.startswith(f"{log}: has no channel RX_*; it has FLEET_STATE, TRACK; a pattern is")
+
+
+def test_a_number_that_has_a_name_is_printed_with_it():
+    assert "state=0 (IDLE) since_utime=0 " in describe(podwatch.mission_state_t())
+    assert " command=1 (START)" in describe(make(podwatch.mission_state_t, command=1))
+    assert " state=1 (TRACKING) " in describe(make(podwatch.track_t, state=podwatch.track_t.TRACKING))
+    rows = [make(podwatch.fleet_row_t, id=2, state=99), make(podwatch.fleet_row_t, id=3, state=1)]
+    told = describe(make(podwatch.fleet_state_t, n_rows=2, rows=rows))
+    assert "state=99 animal" in told, "a state of another version"
+    assert "state=1 (TAKEOFF) animal" in told
 
 
 @pytest.mark.parametrize("command", ["info", "cat"])
@@ -144,3 +156,9 @@ def test_long_members_are_cut_and_counted():
     track = make(podwatch.track_t, n_outline=20, outline=[[i, i] for i in range(20)])
     assert describe(track).endswith("[6, 6], [7, 7], +12 more]")
     assert describe(b"\x01" * 20) == "20 bytes " + " ".join(["01"] * 16)
+
+
+def test_the_help_tells_what_is_taken_where_nothing_is_given():
+    told = " ".join(CliRunner().invoke(cli.app, ["replay", "--help"], env={"COLUMNS": "200"}).stdout.split())
+    assert "ms between two times. [default: (0; 100 for a log of real time)]" in told
+    assert "Share of a number. [default: (0; 0.01 for a log of real time)]" in told

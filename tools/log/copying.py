@@ -7,7 +7,7 @@ import typer
 
 from tools.log.shared import LogPath, app, clear_errors, warn
 
-Out = Annotated[Path | None, typer.Option(help="The file to write. [default: beside the log]")]
+Out = Annotated[Path | None, typer.Option(help="The file to write.", show_default="beside the log")]
 
 
 @app.command("recover")
@@ -24,7 +24,7 @@ def recover_log(path: LogPath, out: Out = None) -> None:
 def split_log(
     path: LogPath,
     every: Annotated[float, typer.Option(help="Length of a part, s of log time.")],
-    out: Annotated[Path | None, typer.Option(help="Folder for the parts. [default: NAME.parts]")] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder for the parts.", show_default="NAME.parts")] = None,
 ) -> None:
     """Cut a log into parts; what reads a restarted logger's files reads them as one."""
     from logs.copying import split
@@ -65,7 +65,7 @@ def from_event_log(
     path: Annotated[Path, typer.Argument(help="An LCM event log, as lcm-logger writes.", show_default=False)],
     out: Out = None,
     drone: Annotated[
-        int | None, typer.Option(min=0, max=99, help="Whose bus it was. [default: as its messages say]")
+        int | None, typer.Option(min=0, max=99, help="Whose bus it was.", show_default="as its messages say")
     ] = None,
 ) -> None:
     """Turn an LCM event log into a drone's log."""

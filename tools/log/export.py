@@ -33,7 +33,9 @@ def export_logs(
     every: Annotated[float, typer.Option(help="s between two points of a track.")] = 1.0,
     began: Annotated[
         str | None,
-        typer.Option(help="Wall time of the logs' first message, 2026-05-01T09:30:00Z. [default: by GPS]"),
+        typer.Option(
+            help="Wall time of the logs' first message, 2026-05-01T09:30:00Z.", show_default="by GPS"
+        ),
     ] = None,
 ) -> None:
     """Write the tracks of drones and animals (--geojson, --csv, --gpx), or all that was seen (--foxglove,

@@ -1,5 +1,6 @@
 """`podwatch log`: look into a drone's MCAP log. `info` says what it holds, `cat` prints its messages."""
 
+import fnmatch
 import sys
 from typing import Annotated, Any
 
@@ -13,6 +14,7 @@ from logs.exceptions import LogError
 from logs.reader import LogInfo, info, read
 from logs.schemas import PACKAGE
 from logs.writer import BOOT
+from tools.log.names import value_name
 from tools.log.shared import LogPath, app, clear_errors, size_text, warn
 
 __all__ = ["describe", "describe_value"]
@@ -38,11 +40,11 @@ def show_info(path: LogPath) -> None:
 def show_messages(
     path: LogPath,
     channel: Annotated[
-        list[str] | None, typer.Option("--channel", "-c", help="Only this channel; may be given again.")
+        list[str] | None, typer.Option("--channel", "-c", help="Only this channel; RX_* is a pattern.")
     ] = None,
     start: Annotated[float, typer.Option(help="First second, counted from the log's first message.")] = 0.0,
     end: Annotated[
-        float | None, typer.Option(help="Last second, counted alike. [default: the log's end]")
+        float | None, typer.Option(help="Last second, counted alike.", show_default="the log's end")
     ] = None,
     limit: Annotated[int | None, typer.Option(min=1, help="At most this many messages.")] = None,
 ) -> None:
@@ -50,9 +52,10 @@ def show_messages(
     with clear_errors():
         if end is not None and end < start:
             raise LogError(f"--end {end:g} lies before --start {start:g}; give an end of at least the start")
-        start_ns = info(path).start_ns
+        log = info(path)
+        start_ns = log.start_ns
         printed = 0
-        for name, log_time_ns, message in read(path, channels=channel or None):
+        for name, log_time_ns, message in read(path, channels=_fitting(log, channel)):
             at_s = (log_time_ns - start_ns) / 1e9
             if at_s < start:
                 continue
@@ -64,11 +67,33 @@ def show_messages(
                 break
 
 
+def _fitting(log: LogInfo, patterns: list[str] | None) -> list[str] | None:
+    """The log's channels that fit the patterns, None for all. Raises LogError where one fits none."""
+    if not patterns:
+        return None
+    present = [channel.name for channel in log.channels]
+    for pattern in patterns:
+        if not any(fnmatch.fnmatchcase(name, pattern) for name in present):
+            raise LogError(
+                f"{log.path}: has no channel {pattern}; it has {', '.join(present) or 'none'}; a pattern is "
+                "'RX_*', in quotes"
+            )
+    return [name for name in present if any(fnmatch.fnmatchcase(name, pattern) for pattern in patterns)]
+
+
 def describe(message: Any) -> str:
-    """A message's members on one line; bytes that did not decode are shown by number and beginning."""
+    """A message's members on one line, each with its value's name where it has one; bytes that did not decode
+    are shown by number and beginning.
+    """
     if isinstance(message, bytes):
         return f"{len(message)} bytes {message[:LONGEST_RAW].hex(' ')}"
-    return " ".join(f"{name}={describe_value(getattr(message, name))}" for name in message.__slots__)
+    return " ".join(_member(message, name) for name in message.__slots__)
+
+
+def _member(message: Any, name: str) -> str:
+    value = getattr(message, name)
+    meaning = value_name(message, name)
+    return f"{name}={describe_value(value)}" + (f" ({meaning})" if meaning else "")
 
 
 def describe_value(value: Any) -> str:

@@ -27,9 +27,9 @@ def report(
     out: Annotated[
         Path | None,
         typer.Option(
-            help="The page to write. [default: report.html in the mission's folder, or here for a day; "
-            "logs_report.html beside logs that are given by name]",
-            show_default=False,
+            help="The page to write.",
+            show_default="report.html in the mission's folder, or here for a day; logs_report.html beside "
+            "logs that are given by name",
         ),
     ] = None,
 ) -> None:

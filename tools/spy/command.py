@@ -26,7 +26,7 @@ UP, DOWN, RIGHT, LEFT = "\x1b[A", "\x1b[B", "\x1b[C", "\x1b[D"
 def spy(
     drone: Annotated[int, typer.Option("--drone", "-d", min=1, max=99, help="Whose bus.")] = 1,
     slot: Annotated[
-        int | None, typer.Option(min=0, max=49, help="Which run's. [default: the lowest that runs]")
+        int | None, typer.Option(min=0, max=49, help="Which run's.", show_default="the lowest that runs")
     ] = None,
     url: Annotated[str | None, typer.Option(help="Another bus, udpm://GROUP:PORT.")] = None,
     channel: Annotated[
