@@ -98,7 +98,7 @@ def test_a_drones_bus_that_leaves_the_loopback_is_told(monkeypatch):
     assert finding.mend.startswith(
         as_root("ip route replace 239.255.76.0/24 dev lo") + "  # until the next boot"
     )
-    assert "podwatch-N-net.service" in finding.mend
+    assert "podwatch fleet units" in finding.mend
 
 
 def test_a_bus_that_is_not_heard_is_told(monkeypatch):

@@ -43,7 +43,7 @@ def check_route(*, on_drone: bool = False) -> Finding:
     """Whether a message to a drone's group leaves and is heard again; on a drone, over the loopback alone."""
     what = "multicast"
     up = f"{as_root('ip link set lo up')} && " if not _is_loopback_up() else ""
-    mend = until_boot(up + as_root(ROUTE_COMMAND), "podwatch-N-net.service of `podwatch fleet units`")
+    mend = until_boot(up + as_root(ROUTE_COMMAND), "podwatch fleet units")
     if not has_multicast_route():
         return Finding(what, lacks="no multicast route: there can be no bus", mend=mend)
     source = _source_address()

@@ -111,8 +111,7 @@ def check_radio(what: str, address: str) -> Finding:
         return Finding(
             what,
             lacks=f"udp {address}: this machine has no address {host}, where the others reach it",
-            mend="ip -br address  # is it the right machine? Then give it that address, or set radio to "
-            "the one it has",
+            mend="ip -br address  # the right machine? Then give it that address, or set radio to its own",
         )
     return Finding(what, f"udp {address} is free")
 
