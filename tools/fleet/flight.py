@@ -11,10 +11,12 @@ import lcm
 
 from lcmtypes import channels
 from procs import processes
+from procs.bus_executor import ROUTE_COMMAND
 from procs.navigator.states import State
 from procs.runtime import RuntimeFailure
 from procs.settings import Mission
 from tools.buses import Slot, bus_url
+from tools.doctor.mend import as_root
 from tools.fleet.machine import drone_settings
 from tools.heartbeats import HeartbeatGuard, end_hung
 from tools.live import SHOWN, LiveView
@@ -33,7 +35,7 @@ def open_bus(url: str) -> Any:
         return lcm.LCM(url)
     except RuntimeError as error:
         raise RuntimeFailure(
-            f"no bus at {url} ({error}); is there a multicast route? Try: ip route add 224.0.0.0/4 dev lo"
+            f"no bus at {url} ({error}); is there a multicast route? Try: {as_root(ROUTE_COMMAND)}"
         ) from error
 
 
