@@ -7,8 +7,9 @@ BOOT_ID = Path("/proc/sys/kernel/random/boot_id")  # random(4): drawn anew at ea
 
 
 class MonotonicClock:
-    """Microseconds since boot. Drone seconds are real seconds. boot: the kernel's name for this boot, "" where
-    it gives none.
+    """Microseconds since boot. Drone seconds are real seconds.
+
+    boot: the kernel's name for this boot, "" where it gives none.
     """
 
     def __init__(self) -> None:
