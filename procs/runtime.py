@@ -93,7 +93,7 @@ class Runtime(ABC):
 
     @property
     def boot(self) -> str:
-        """From which start of this computer `utime` counts, "" where the clock does not say (virtual time)."""
+        """From which start of the computer `utime` counts, "" where the clock does not say: virtual time."""
         return ""
 
     @property
