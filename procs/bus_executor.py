@@ -73,7 +73,8 @@ class BusRuntime(Runtime):
             self._lcm = lcm.LCM(settings.bus_url)
         except RuntimeError as error:
             raise RuntimeFailure(
-                f"no bus at {settings.bus_url} ({error}); is there a multicast route? Try: {ROUTE_COMMAND}"
+                f"no bus at {settings.bus_url} ({error}); is there a multicast route? "
+                f"As root: {ROUTE_COMMAND}"
             ) from error
         self._transports: list[tuple[Transport, Callable[[], None]]] = []
         self._ready: list[Any] = []

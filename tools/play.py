@@ -108,8 +108,8 @@ def _open_buses(
             opened = {url: lcm.LCM(url) for url in dict.fromkeys(urls.values())}
         except RuntimeError as error:
             raise RuntimeFailure(
-                f"no bus at {', '.join(urls.values())} ({error}); is there a multicast route? Try: "
-                f"{ROUTE_COMMAND}"
+                f"no bus at {', '.join(urls.values())} ({error}); is there a multicast route? "
+                f"As root: {ROUTE_COMMAND}"
             ) from error
         for drone_id, url in urls.items():
             console.print(f"drone {drone_id} on {url}", soft_wrap=True)

@@ -49,7 +49,7 @@ def read_key(path: Path) -> bytes:
         text = path.read_bytes()
     except OSError as error:
         raise FleetKeyError(
-            f"{path}: no fleet key can be read: {error.strerror}; make one, or copy it"
+            f"{path}: no fleet key can be read: {error.strerror}; copy the fleet's, or make one for all"
         ) from error
     if mode & 0o077:
         raise FleetKeyError(f"{path}: mode {mode:04o} lets others read the fleet key; run: chmod 600 {path}")

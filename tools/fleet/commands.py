@@ -20,7 +20,7 @@ FleetFile = Annotated[Path, typer.Argument(help="The fleet file.", show_default=
 def new(
     path: FleetFile = Path("fleet.toml"),
     drones: Annotated[int, typer.Option(min=1, help="How many drones.")] = 3,
-    name: Annotated[str, typer.Option(help="What the fleet is called. [default: the file's name]")] = "",
+    name: Annotated[str, typer.Option(help="What the fleet is called.", show_default="the file's name")] = "",
 ) -> None:
     """Write a fleet file with a comment on every value that people change."""
     from procs.settings import MAX_DRONES, MissionError

@@ -30,7 +30,7 @@ HOME_SPACING_M = 10.0  # two drones that land beside each other are each 1.5 m o
 SENSORS = ("pixels", "boxes")
 SIMULATED = "sim"
 LINKS = ("udp", "udpout", "tcp", "serial")
-NO_ROUTE = f"no multicast route; for real buses: {ROUTE_COMMAND}"
+NO_ROUTE = f"no multicast route; for real buses, as root: {ROUTE_COMMAND}"
 
 
 def command(

@@ -59,7 +59,6 @@ class WorldTable(Section):
     radio_loss: float = Field(0.02, ge=0, le=0.9)  # share of the datagrams that are lost
     radio_latency_s: float = Field(0.008, ge=0, le=1)  # of every datagram
     scene_width_m: float = Field(60.0, gt=1, le=5000)  # ground width of a --scene picture
-    compass_uniform: bool = True  # of no effect
 
 
 class Fault(Section):
