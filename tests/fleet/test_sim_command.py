@@ -23,7 +23,7 @@ from tools.sim.processes import SHARED_FOLDER
 ROOT = Path(__file__).parents[2]
 PODWATCH = (sys.executable, "-c", "from tools.cli import main; main()")
 QUICK = ("sim", "--headless", "--sensor", "boxes", "--drones", "1")
-REASON = "no multicast route; for real buses: ip route replace 239.255.76.0/24 dev lo"
+REASON = "no multicast route; for real buses, as root: ip route replace 239.255.76.0/24 dev lo"
 START_LIMIT_S = 120.0
 STOP_LIMIT_S = 60.0
 
