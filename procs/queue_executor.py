@@ -59,6 +59,8 @@ class ClockError:
         guess = round((utime - self.offset_us) / (1 + self.drift_ppm * 1e-6))
         while self.utime(guess) < utime:
             guess += 1
+        while self.utime(guess - 1) >= utime:  # a slow clock shows the same instant twice now and then
+            guess -= 1
         return guess
 
 

@@ -1,6 +1,6 @@
 """The executor in virtual time: order of events, compute time, clocks, death."""
 
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from lcmtypes import channels, make
@@ -168,6 +168,7 @@ def test_heartbeats_tell_no_pid_and_no_machine_so_that_two_runs_are_the_same_byt
     drift_ppm=st.floats(-500, 500),
     true_us=st.integers(0, 10**11),
 )
+@example(offset_us=0, drift_ppm=-274.87890625, true_us=60026)
 def test_a_drones_clock_and_virtual_time_are_each_others_inverse(offset_us, drift_ppm, true_us):
     clock = ClockError(offset_us, drift_ppm)
     utime = clock.utime(true_us)
