@@ -21,9 +21,10 @@ from procs.detector.network import PROVIDERS, Names, Network, open_session
 from procs.detector.sight import Sight
 from procs.detector.tiles import SeenLength, Tile, merge, owned, pieces, plan, shortfall
 
-__all__ = ["Detections", "Detector", "ModelError", "open_session"]
+__all__ = ["CONFIDENCE", "Detections", "Detector", "ModelError", "open_session"]
 
 Image = NDArray[np.uint8]
+CONFIDENCE = 0.25  # least score of a find, where nobody asks for another
 LOOKS_KEPT = 9  # whose median says how long a look takes
 
 
@@ -64,7 +65,7 @@ class Detector:
     def __init__(
         self,
         model_path: str | Path | None = None,
-        confidence: float = 0.25,
+        confidence: float = CONFIDENCE,
         iou: float = 0.45,
         classes: Sequence[int | str] | None = None,
         tile: int | Literal["auto"] | None = None,

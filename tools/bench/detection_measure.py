@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from procs.detector.yolo import Detections, Detector
+from procs.detector.yolo import CONFIDENCE, Detections, Detector
 from tools.render import Scene, scenes
 from tools.train.detector.samples import WITH_EXTRAS, held_out, read_yolo, real_data
 from tools.train.detector.scores import MATCH_IOU, average_precision, box_iou, match, match_animals
@@ -24,7 +24,6 @@ __all__ = [
     "rendered",
 ]
 
-CONFIDENCE = 0.25  # the detector's own, at which it flies
 CONFIDENCES = (0.25, 0.4, 0.55)  # the paper's figure has three; it does not say which
 LEAST = 0.01  # average precision needs the low scores too
 SIDE = (640, 480)  # px, as the drones' cameras

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from onnxruntime.quantization import CalibrationDataReader, QuantFormat, QuantType, quantize_static
 from onnxruntime.quantization.shape_inference import quant_pre_process
 
-from procs.detector.yolo import open_session
+from procs.detector.yolo import CONFIDENCE, open_session
 from tools.errors import UnusableError
 from tools.train.detector.export import describe
 from tools.train.detector.model import STRIDES
@@ -21,7 +21,6 @@ from tools.train.detector.scores import box_iou
 __all__ = ["quantise"]
 
 CHECKED_PICTURES = 16
-CONFIDENCE = 0.25  # at which the detector flies: below it a box means little
 BEST_CELLS = 10  # of a picture: those that answer for its animals, if it has any
 LARGEST_SCORE_DIFFERENCE = 0.05  # 0.02 is usual; scores without their own scale differ by 0.5
 LEAST_IOU = 0.9  # 0.975 is usual

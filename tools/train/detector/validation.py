@@ -5,13 +5,12 @@ from pathlib import Path
 
 import numpy as np
 
-from procs.detector.yolo import Detector
+from procs.detector.yolo import CONFIDENCE, Detector
 from tools.train.detector.own import learnt_as_well, validation_pictures
 from tools.train.detector.scores import average_precision, match
 
 __all__ = ["count_validation", "measure"]
 
-CONFIDENCE = 0.25  # at which the detector flies
 LEAST_SCORE = 0.01  # average precision needs the low scores too
 SMALL_PX = 16  # in the network's input; the detector looks at such animals in tiles
 
